@@ -1,4 +1,4 @@
-"""Walls of fixed surfaces that a body could pass: speeds at which a contact begins behind a wall's middle, or ends there.
+"""Walls of fixed surfaces that a body could pass, and the speeds at which it does.
 
 A sphere is pushed out of a wall by the shortest way: to where it came from only until its centre has passed the wall's
 middle (derived). It reaches that depth at once if it moves so far in a step; or during an impact, since a contact
@@ -30,8 +30,8 @@ from .world import State, World
 _PAIRS = 4_000_000
 """Maximum number of pairs of a ray and a triangle by which a mesh's thickness is found; larger ones are sampled."""
 _KEPT = 16
-_SAID: set[tuple[str, str]] = set()
-"""Bodies and surfaces that a warning was given of: the rollouts of a dataset are alike."""
+_SAID: set[str] = set()
+"""Bodies that a warning was given of: the rollouts of a dataset are alike."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,12 +79,15 @@ def require_thick_walls(world: World, state: State, name: str | None = None) -> 
     Raises:
         InputDataError: If one does, with body, surface, speed and depth.
     """
+    weakest: dict[str, tuple[float, str]] = {}
     for wall in walls(world) if world.surfaces else ():
         speed = _speeds(world, state, wall.number)
         fastest = int(speed.argmax())
         begin, fall = float(speed[fastest]), float(_after_fall(world, state, wall, speed).max())
         place = f"{name or world.called(f'environment {fastest}')}: body '{wall.body}'"
-        thick = f"surface '{wall.surface.name}', whose middle its smallest sphere reaches {1e3 * wall.depth_m:.3g} mm deep"
+        thick = (
+            f"surface '{wall.surface.name}', whose middle its smallest sphere reaches {1e3 * wall.depth_m:.3g} mm deep"
+        )
         if begin > wall.jump_m_s:
             raise InputDataError(
                 f"{place} begins at {begin:.3g} m/s, {1e3 * begin * world.step_s:.3g} mm in a step: it can jump over "
@@ -92,12 +95,13 @@ def require_thick_walls(world: World, state: State, name: str | None = None) -> 
                 f"up to {wall.jump_m_s:.3g} m/s.",
                 "make the wall a thicker box, take a smaller step, or begin slower.",
             )
-        if fall > wall.impact_m_s:
-            _warn(
-                (wall.body, wall.surface.name),
-                f"{place} may reach {fall:.3g} m/s, and from {wall.impact_m_s:.3g} m/s on an impact takes it through "
-                f"{thick}. A thicker wall or a stiffer contact (a smaller contact_time_s) holds it.",
-            )
+        text = f"{place} may reach {fall:.3g} m/s, and from {wall.impact_m_s:.3g} m/s on an impact takes it through "
+        text += f"{thick}. A thicker wall or a stiffer contact (a smaller contact_time_s) holds it."
+        weakest[wall.body] = max(weakest.get(wall.body, (1.0, "")), (fall / wall.impact_m_s, text))
+    for body, (excess, text) in weakest.items():
+        if excess > 1 and body not in _SAID:
+            _SAID.add(body)
+            logging.getLogger("cgwm").warning("%s", text)
 
 
 def thin_wall_warnings(world: World) -> list[str]:
@@ -121,7 +125,10 @@ def _speeds(world: World, state: State, number: int) -> torch.Tensor:
     """Return bounds (B,) of the speeds of a body's points [m/s]."""
     body = world.bodies[number]
     reach = (plain(body.centers).norm(dim=-1) + plain(body.radii)).amax(-1)
-    return plain(state.velocity_m_s)[:, number].norm(dim=-1) + plain(state.omega_body_rad_s)[:, number].norm(dim=-1) * reach
+    return (
+        plain(state.velocity_m_s)[:, number].norm(dim=-1)
+        + plain(state.omega_body_rad_s)[:, number].norm(dim=-1) * reach
+    )
 
 
 def _after_fall(world: World, state: State, wall: Wall, speed: torch.Tensor) -> torch.Tensor:
@@ -191,9 +198,3 @@ def _way_through(start: np.ndarray, way: np.ndarray, corners: tuple[np.ndarray, 
     v, far = (other @ way) / safe, (other * (c - a)).sum(1) / safe
     meets = (volume < 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (far > 1e-9 * side_m)
     return float(far[meets].min(initial=np.inf))
-
-
-def _warn(key: tuple[str, str], text: str) -> None:
-    if key not in _SAID:
-        _SAID.add(key)
-        logging.getLogger("cgwm").warning("%s", text)

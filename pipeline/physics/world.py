@@ -291,7 +291,7 @@ class World:
 
         ground = file.ground
         world = World(
-            surfaces=_surfaces(model, tensor),
+            surfaces=fixed_surfaces(model, tensor),
             chains=tuple(chain_of_model(entry, tensor(0.0)) for entry in file.articulations),
             bodies=tuple(bodies),
             gravity=tensor(file.gravity_m_s2),
@@ -410,8 +410,13 @@ def _patch(entry: BodyModel, hull: Hull | None, centers: Tensor, radii: Tensor) 
     return found
 
 
-def _surfaces(model: Model, tensor: Callable[[object], Tensor]) -> tuple[FixedSurface, ...]:
-    """Return the fixed surfaces of a model; `tensor` as in :func:`_body`."""
+def fixed_surfaces(model: Model, tensor: Callable[[object], Tensor]) -> tuple[FixedSurface, ...]:
+    """Return the fixed surfaces of a model.
+
+    Args:
+        model: The model.
+        tensor: Function that makes a tensor, with a batch dimension of 1, of numbers.
+    """
     found = []
     for entry in model.file.surfaces:
         kind, size = shape_of(entry)

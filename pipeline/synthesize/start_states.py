@@ -18,6 +18,7 @@ from ..geometry.viewpoint import rotation_matrix
 from .distributions import draw
 from .plan import Extent, StartRanges, extent, horizontal_direction, up_direction
 from .pusher_paths import commanded_velocity, push_track
+from .supports import Supports
 
 MAX_PLACEMENTS = 200
 """Maximum number of draws of a start without overlap."""
@@ -79,7 +80,8 @@ def draw_start(model: Model, plan: SamplingPlan, duration_s: float, rng: np.rand
 def _place_apart(
     start: Start, free: list[int], model: Model, plan: SamplingPlan, extents: list[Extent], rng: np.random.Generator
 ) -> None:
-    """Place the free bodies; draw again until no two bounding spheres overlap."""
+    """Place the free bodies; draw again until no bounding spheres overlap, and none of a thrown body a surface."""
+    supports = Supports.of(model)
     for _ in range(MAX_PLACEMENTS):
         for index in free:
             if plan.start == "throw":
@@ -92,7 +94,10 @@ def _place_apart(
         # Driven bodies are placed afterwards, relative to the free ones.
         others = [index for index, body in enumerate(model.file.bodies) if body.motion != "driven"]
         pairs = [(a, b) for a in free for b in others if a != b]
-        if all(np.linalg.norm(centers[a] - centers[b]) > extents[a].radius_m + extents[b].radius_m for a, b in pairs):
+        apart = all(
+            np.linalg.norm(centers[a] - centers[b]) > extents[a].radius_m + extents[b].radius_m for a, b in pairs
+        )
+        if apart and not (plan.start == "throw" and _in_surfaces(supports, free, centers, extents)):
             return
     raise NotConvergedError(
         f"{plan.source}: no start without overlap in {MAX_PLACEMENTS} draws for {len(free)} free bodies.",
@@ -100,8 +105,18 @@ def _place_apart(
     )
 
 
+def _in_surfaces(supports: Supports, free: list[int], centers: list[np.ndarray], extents: list[Extent]) -> bool:
+    """Return whether the bounding sphere of a free body overlaps a surface."""
+    if not supports.surfaces:
+        return False
+    one = np.zeros((1, 3))
+    return any(
+        bool(supports.overlaps(centers[index][None], one, np.array([extents[index].radius_m])).any()) for index in free
+    )
+
+
 def _throw(start: Start, index: int, model: Model, plan: SamplingPlan, size: Extent, rng: np.random.Generator) -> None:
-    ranges, file, up = StartRanges.of(plan), model.file, up_direction(model.file)
+    ranges, up = StartRanges.of(plan), up_direction(model.file)
     if plan.orientation == "any":
         quat = rng.normal(size=4)
         start.quat_wxyz[index] = quat / np.linalg.norm(quat)
@@ -109,8 +124,8 @@ def _throw(start: Start, index: int, model: Model, plan: SamplingPlan, size: Ext
         start.quat_wxyz[index] = _upright(model, index, plan, rng)
     place = _place(model, index, ranges.offset_m, rng)
     gap = draw(ranges.height_m, rng)
-    floor = file.ground.offset_m if file.ground else float(place @ up) - size.radius_m
-    center = place + up * (floor + size.radius_m + gap - place @ up)
+    middle = Supports.of(model).rest_height(place, np.zeros((1, 3)), np.array([size.radius_m]))
+    center = place + up * ((float(place @ up) if middle is None else middle) + gap - place @ up)
     start.position_m[index] = center - rotation_matrix(start.quat_wxyz[index]) @ size.center_m
     heading = _heading(plan.heading_deg, up, rng)
     speed, rise = draw(ranges.horizontal_speed_m_s, rng), draw(ranges.vertical_speed_m_s, rng)
@@ -135,15 +150,16 @@ def _launch(start: Start, index: int, velocity: np.ndarray, center: np.ndarray) 
 
 
 def _rest(start: Start, index: int, model: Model, plan: SamplingPlan, rng: np.random.Generator) -> None:
-    """Turn a body about the vertical, and place its lowest collision sphere on the ground."""
-    file, body, up = model.file, model.file.bodies[index], up_direction(model.file)
+    """Turn a body about the vertical, and lower it until a collision sphere touches the ground or a surface."""
+    body, up = model.file.bodies[index], up_direction(model.file)
     start.quat_wxyz[index] = _upright(model, index, plan, rng)
     start.position_m[index] = _place(model, index, StartRanges.of(plan).offset_m, rng)
-    if file.ground is None:
-        return
-    low, _ = _heights(model, body, start.quat_wxyz[index], up)
-    position = start.position_m[index]
-    start.position_m[index] = position + up * (file.ground.offset_m - low - position @ up)
+    spheres, position = model.collision[body.name], start.position_m[index]
+    arms = np.asarray(spheres.means, float) @ rotation_matrix(start.quat_wxyz[index]).T
+    radii = np.asarray(spheres.scales, float) * body.radius_factor
+    height = Supports.of(model).rest_height(position, arms, radii)
+    if height is not None:
+        start.position_m[index] = position + up * (height - position @ up)
 
 
 def _upright(model: Model, index: int, plan: SamplingPlan, rng: np.random.Generator) -> np.ndarray:

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+import torch
 
 from ...datasets.models.model import Model
+from ..physics.fixed_surface import FixedSurface
+from ..physics.world import fixed_surfaces
 from .faults import Fault
 from .rollout import Rollout
 
@@ -44,7 +47,8 @@ def _check_distances(rollout: Rollout, model: Model) -> Iterator[Fault]:
     """Check that the gap of each contact is one that spheres of its bodies can have at their places.
 
     The gap of a sphere to the ground is its body's height above it within the body's reach; that of a sphere to another
-    body is at most their distance and both reaches, and deeper than both reaches nothing can be.
+    body is at most their distance and both reaches, and deeper than both reaches nothing can be. The gap to a fixed
+    surface is its body's distance from it within the reach; of a mesh, that from its box is the least.
     """
     contacts, places, frame = rollout.part("contacts"), rollout.values["bodies/pos"], _frames(rollout)
     reach = np.array([_reach_m(model, name) for name in rollout.bodies])
@@ -61,15 +65,26 @@ def _check_distances(rollout: Rollout, model: Model) -> Iterator[Fault]:
         offset_m = rollout.attributes.parameters.get("ground_offset_m", given)[0]
         height = places[frame, a] @ np.asarray(model.file.ground.normal) - offset_m
         off[on_ground] = (np.abs(gap - height) - REACH_SLACK * reach[a])[on_ground]
-    both = REACH_SLACK * (reach[a] + reach[b])
-    apart = np.linalg.norm(places[frame, a] - places[frame, b], axis=-1)
+    other = np.where(on_body, b, a)
+    both = REACH_SLACK * (reach[a] + reach[other])
+    apart = np.linalg.norm(places[frame, a] - places[frame, other], axis=-1)
     off[on_body] = (np.maximum(gap - apart, -gap) - both)[on_body]
+    for number, surface in enumerate(_surfaces(model) if (b < -1).any() else ()):
+        there = b == -2 - number
+        far = surface.bound(torch.as_tensor(places[frame, a][there], dtype=torch.float64)[None])[0].numpy()
+        lacking, exceeding = far - gap[there], gap[there] - far
+        wrong = np.maximum(lacking, -gap[there] if surface.mesh is not None else exceeding)
+        off[there] = wrong - REACH_SLACK * reach[a][there]
     if (off > 0).any():
         row = int(off.argmax())
         name = rollout.bodies[a[row]]
         text = f"contacts/distance: frame {frame[row]}: {gap[row]:.3g} m; where the bodies are, spheres of '{name}' "
         text += f"miss that by {off[row]:.3g} m or more."
         yield Fault(check="contacts", text=text, frame=int(frame[row]), body=name, value=float(gap[row]))
+
+
+def _surfaces(model: Model) -> tuple[FixedSurface, ...]:
+    return fixed_surfaces(model, lambda x: torch.as_tensor(np.asarray(x), dtype=torch.float64)[None])
 
 
 def _reach_m(model: Model, name: str) -> float:

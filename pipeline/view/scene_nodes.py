@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...datasets.capture.cameras import Camera
+from ...datasets.shapes.meshes import Mesh
 from ...datasets.shapes.ply import Splats
+from ...schemas.surfaces import Surface
 from ..rendering.contact_glyphs import ContactMarks
 from .scene_at import BodyShape
 
@@ -24,6 +26,7 @@ half-precision floats, whose maximum is 65504."""
 _POINT_RADIUS = 0.1
 """Radius of a contact point [radii of the largest free body]."""
 _SPHERE_RGB = (120, 190, 120)
+_SURFACE_RGB, _SURFACE_OPACITY = (150, 160, 175), 0.45
 
 
 def add_splats(scene: Any, name: str, splats: Splats) -> Any:
@@ -45,6 +48,37 @@ def add_spheres(scene: Any, name: str, shape: BodyShape) -> Any:
     if not len(shape.radii_m):
         return None
     return _add_balls(scene, name, shape.centers_m, shape.radii_m, np.array(_SPHERE_RGB, np.uint8))
+
+
+def add_surface(scene: Any, surface: Surface, mesh: Mesh | None, size_m: float) -> Any:
+    """Add a fixed surface, see-through, and return its handle; a half space is a grid of squares of `size_m`."""
+    name, place = f"/surfaces/{surface.name}", {"wxyz": surface.pose.quat_wxyz, "position": surface.pose.position_m}
+    if surface.half_space is not None:
+        return scene.add_grid(name, 20 * size_m, 20 * size_m, cell_size=size_m, **place)
+    vertices, faces = _triangles(surface) if mesh is None else (mesh.vertices, mesh.faces)
+    return scene.add_mesh_simple(
+        name,
+        vertices=np.asarray(vertices, np.float32),
+        faces=np.asarray(faces, np.uint32),
+        color=_SURFACE_RGB,
+        opacity=_SURFACE_OPACITY,
+        flat_shading=True,
+        side="double",
+        **place,
+    )
+
+
+def _triangles(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the corners (V, 3) [m] and triangles (F, 3) of a rectangle, box or cylinder, in its frame."""
+    import trimesh  # comes with viser  # pyright: ignore[reportMissingImports]
+
+    if surface.cylinder is not None:
+        sizes = {"radius": surface.cylinder.radius_m, "height": 2 * surface.cylinder.half_length_m}
+        shape = trimesh.creation.cylinder(**sizes, sections=48)
+    else:
+        half = surface.box.half_extents_m if surface.box is not None else (*surface.rectangle.half_extents_m, 0.0)  # pyright: ignore[reportOptionalMemberAccess]
+        shape = trimesh.creation.box(extents=2 * np.asarray(half))
+    return np.asarray(shape.vertices), np.asarray(shape.faces)
 
 
 def _add_balls(scene: Any, name: str, centers_m: NDArray[Any], radii_m: NDArray[Any], colors: NDArray[np.uint8]) -> Any:

@@ -25,6 +25,7 @@ from .scene_nodes import (
     add_marks,
     add_spheres,
     add_splats,
+    add_surface,
     as_bytes,
     place_marks,
     turn_from_z,
@@ -142,6 +143,9 @@ class Viewer:
             place = np.asarray(ground.normal) * ground.offset_m
             side = 20 * size
             scene.add_grid("/ground", side, side, cell_size=size, wxyz=turn_from_z(ground.normal), position=place)
+        self._surfaces = [
+            add_surface(scene, one, model.surface_meshes.get(one.name), size) for one in model.file.surfaces
+        ]
         self._frames = [
             scene.add_frame(f"/bodies/{k}", show_axes=False, axes_length=1.5 * size, axes_radius=0.04 * size)
             for k in range(len(self._shapes))

@@ -28,10 +28,11 @@ from cgwm.pipeline.view.door import Door
 from cgwm.pipeline.view.motions import can_move, own_motion, recorded_motion, still
 from cgwm.pipeline.view.scene_at import LONGEST_ARROW, background_from, radius_m, scene_at, shapes_of, viewpoint
 from cgwm.pipeline.view.viewer import FIELD_OF_VIEW_RAD
-from cgwm.schemas import Light, SamplingPlan, SynthesizeConfig, UsageError
+from cgwm.schemas import Light, SamplingPlan, Surface, SynthesizeConfig, UsageError
 from helpers.browser import Page, chromium
 from helpers.forked import Forked
 from helpers.small_model import HALF, small_model, write_small_model
+from helpers.tray import bowl, in_tray
 
 CONFIG = SynthesizeConfig(rollouts=2, duration_s=0.5, width=64, height=48, device="cpu", seed=5)
 VISER = importlib.util.find_spec("viser") is not None
@@ -162,6 +163,26 @@ def test_a_missing_viser_is_one_clear_message(
     monkeypatch.setitem(sys.modules, "viser", None)
     err = refused(capfd, "view", dataset)
     assert err == "'cgwm view' needs the package viser.\nNext: pip install 'cgwm[view]'.\n"
+
+
+@needs_viser
+def test_fixed_surfaces_are_in_the_scene(tmp_path: Path) -> None:
+    shape, mesh = bowl()
+    others = [
+        {"name": "post", "pose": {"position_m": (0.1, 0.2, 0.3)}, "cylinder": {"radius_m": 0.1, "half_length_m": 0.2}},
+        {"name": "sheet", "rectangle": {"half_extents_m": (0.1, 0.2)}},
+        {"name": "floor", "half_space": {}},
+        {"name": "block", "box": {"half_extents_m": (0.1, 0.2, 0.3)}},
+    ]
+    write_model(tmp_path / "model", in_tray((shape, *map(Surface.model_validate, others)), mesh))
+    with open_view(tmp_path / "model", port=0) as viewer:
+        nodes = {node.name: node for node in viewer._surfaces}
+        assert set(nodes) == {f"/surfaces/{name}" for name in ("bowl", "post", "sheet", "floor", "block")}
+        np.testing.assert_allclose(nodes["/surfaces/post"].position, (0.1, 0.2, 0.3))
+        np.testing.assert_allclose(np.abs(nodes["/surfaces/block"].vertices).max(0), (0.1, 0.2, 0.3), rtol=1e-6)
+        post = np.asarray(nodes["/surfaces/post"].vertices)
+        np.testing.assert_allclose([np.linalg.norm(post[:, :2], axis=1).max(), post[:, 2].max()], (0.1, 0.2), rtol=1e-6)
+        assert len(nodes["/surfaces/bowl"].faces) == len(mesh.faces)
 
 
 @needs_viser
