@@ -39,6 +39,7 @@ from ..segments.described_motion import not_described
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from .material_pairs import require_known_pairs, start_laws
+from .surface_starts import require_outside
 from .tracks.contact_result import PhysicsFit
 from .tracks.earlier_estimates import GROUND, EarlierEstimates
 from .tracks.part_choice import SCALE
@@ -66,6 +67,8 @@ def fit_motion(
     _require_fittable(model, capture, config)
     require_known_pairs(capture, split)
     ready = _with_surfaces(replace(model, file=_physics_start(model, capture, config)), capture)
+    if config.supervise == "tracks":
+        require_outside(World.from_model(ready), capture, split)
     started = time.perf_counter()
     found = _fitted_motion(ready, capture, split, config, checkpoint, model.file.contact is not None)
     found = replace(found, warnings=(*found.warnings, *found.record.unconverged(), *warnings))

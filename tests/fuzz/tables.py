@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from . import accepted, oracle, refused, refused_datasets, refused_models
+from . import accepted, oracle, refused, refused_datasets, refused_models, refused_surfaces
 from .cases import Trial
 from .client import Seen
 from .edits import Row
@@ -12,7 +12,7 @@ from .edits import Row
 
 def must_refuse() -> list[Row]:
     """Return the lines of what has to be refused."""
-    return [*refused.rows(), *refused_models.rows(), *refused_datasets.rows()]
+    return [*refused.rows(), *refused_models.rows(), *refused_datasets.rows(), *refused_surfaces.rows()]
 
 
 def must_accept() -> list[Row]:
