@@ -111,8 +111,15 @@ def touched(record: Any) -> set[int]:
     return {int(b) for b, yes in zip(record.body_b, acted, strict=True) if yes}
 
 
-@pytest.mark.parametrize("lanes", [1, 8])
-@pytest.mark.parametrize("surfaces", [SHAPES, MESHES], ids=["shapes", "meshes"])
+@pytest.mark.parametrize(
+    ("surfaces", "lanes"),
+    [
+        pytest.param(SHAPES, 8, id="shapes-8"),
+        pytest.param(MESHES, 1, id="meshes-1"),
+        pytest.param(SHAPES, 1, id="shapes-1", marks=pytest.mark.evidence),
+        pytest.param(MESHES, 8, id="meshes-8", marks=pytest.mark.evidence),
+    ],
+)
 def test_a_body_on_surfaces(fused: Fused, surfaces: tuple[Any, ...], lanes: int) -> None:
     world, state, time = scene(surfaces), tossed(6), times(0.15, 20)
     with torch.no_grad():
@@ -139,7 +146,10 @@ def test_two_bodies_a_tilted_ground_and_surfaces(fused: Fused) -> None:
         agree(expected, fused(world, state, times(0.15, 20), True))
 
 
-@pytest.mark.parametrize("surfaces", [SHAPES[:2], MESHES[:1]], ids=["shapes", "meshes"])
+@pytest.mark.parametrize(
+    "surfaces",
+    [pytest.param(SHAPES[:2], id="shapes", marks=pytest.mark.evidence), pytest.param(MESHES[:1], id="meshes")],
+)
 def test_derivatives_by_state_law_and_place_of_a_surface(fused: Fused, surfaces: tuple[Any, ...]) -> None:
     world, time = scene(surfaces), torch.tensor([0.0, 0.05], dtype=F64)
     start = tossed(1, 0.035)
