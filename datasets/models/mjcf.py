@@ -6,14 +6,14 @@ the same restitution and contact time; the penetration at rest differs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...schemas import BodyModel, ContactParameters, InputDataError, ModelFile
+from ...schemas import ArticulationModel, BodyModel, ContactParameters, InputDataError, ModelFile
 from ...schemas.materials import pair_of
 from ...schemas.surfaces import Surface
 from ..capture.cameras import Camera
@@ -28,6 +28,10 @@ IMPEDANCE = 0.99
 """d of solimp; the penetration at rest in MuJoCo is (1 - d) g tau^2 / number of contacts."""
 
 
+MOVED = ("free", "link")
+"""Motions of bodies that physics moves."""
+FAR = 1e4
+"""Stop that no joint reaches, where a joint has only the other one [rad or m]."""
 MOST_PAIRS = 50_000
 """Maximum number of pairs of geoms of two bodies with a contact law of their own."""
 
@@ -53,9 +57,10 @@ def write_mjcf(
 ) -> str:
     """Return the model as MJCF text.
 
-    Free bodies get a free joint, driven ones are mocap bodies, fixed ones are at their photo pose. Collision spheres
-    are `sphere` geoms; without them, the shape from the capture (box or ball) is the geom. Masses, inertia, friction
-    and the contact time and damping are those of the model.
+    Links of jointed bodies are within the links that carry them, with their joints; links of one jointed body do not
+    touch each other. Free bodies get a free joint, driven ones are mocap bodies, fixed ones are at their photo pose.
+    Collision spheres are `sphere` geoms; without them, the shape from the capture (box or ball) is the geom. Masses,
+    inertia, friction and the contact time and damping are those of the model.
 
     Args:
         model: A model with fitted physics.
@@ -79,8 +84,12 @@ def write_mjcf(
     for surface in file.surfaces:
         _add_surface(root, world, surface, model)
     for body in file.bodies:
-        _add_body(world, body, model)
-    _add_pairs(root, model)
+        if body.motion != "link":
+            pose = body.photo_pose
+            _add_body(world, body, model, (pose.position_m, pose.quat_wxyz), body.motion)
+    for one in file.articulations:
+        _add_articulation(world, one, model)
+    _add_contacts(root, model)
     for name, camera in (cameras or {}).items():
         _add_camera(world, name, camera)
     if keyframe is not None:
@@ -164,7 +173,18 @@ def _add_triangles(root: ET.Element, world: ET.Element, name: str, place: dict[s
         ET.SubElement(parent, "geom", name=label, type="mesh", mesh=label)
 
 
-def _add_pairs(root: ET.Element, model: Model) -> None:
+def _add_contacts(root: ET.Element, model: Model) -> None:
+    """Add the laws of pairs of geoms, and that links of one articulation do not touch each other."""
+    contact = ET.Element("contact")
+    _add_pairs(contact, model)
+    for one in model.file.articulations:
+        for first, second in combinations(one.links, 2):
+            ET.SubElement(contact, "exclude", body1=first, body2=second)
+    if len(contact):
+        root.append(contact)
+
+
+def _add_pairs(contact: ET.Element, model: Model) -> None:
     """Add a `pair` for each two geoms whose materials have a law of their own.
 
     A pair takes the place of what MuJoCo makes of the parameters of its two geoms; those of geoms are of all others.
@@ -174,13 +194,14 @@ def _add_pairs(root: ET.Element, model: Model) -> None:
     fixed = [(one.name, one.material, _surface_geoms(one, model)) for one in file.surfaces]
     if file.ground is not None:
         fixed.append(("ground", file.ground.material, ["ground"]))
-    contact = ET.Element("contact")
+    articulation = {link: one.name for one in file.articulations for link in one.links}
     for index, body in enumerate(file.bodies):
-        others = list(fixed) if body.motion == "free" else []
+        others = list(fixed) if body.motion in MOVED else []
         others += [
             (other.name, other.material, _geoms(other, model))
             for other in file.bodies[index + 1 :]
-            if "free" in (body.motion, other.motion)
+            if (body.motion in MOVED or other.motion in MOVED)
+            and (body.name not in articulation or articulation[body.name] != articulation.get(other.name))
         ]
         for other, material, names in others:
             law = None if body.material is None or material is None else laws.get(pair_of(body.material, material))
@@ -197,8 +218,6 @@ def _add_pairs(root: ET.Element, model: Model) -> None:
             numbers = _contact(law) | {"friction": _text((law.friction, law.friction, 0.0, 0.0, 0.0)), "condim": "3"}
             for first, second in product(mine, names):
                 ET.SubElement(contact, "pair", geom1=first, geom2=second).attrib.update(numbers)
-    if len(contact):
-        root.append(contact)
 
 
 def _surface_geoms(surface: Surface, model: Model) -> list[str]:
@@ -213,14 +232,34 @@ def _geoms(body: BodyModel, model: Model) -> list[str]:
     return [f"{body.name}_{k}" for k in range(1 if spheres is None else len(spheres))]
 
 
-def _add_body(world: ET.Element, body: BodyModel, model: Model) -> None:
-    pose = body.photo_pose
-    element = ET.SubElement(world, "body", name=body.name, pos=_text(pose.position_m), quat=_text(pose.quat_wxyz))
-    if body.motion == "driven":
+def _add_articulation(world: ET.Element, one: ArticulationModel, model: Model) -> None:
+    """Add the links of a jointed body, each within the link that carries it, with their joints."""
+    pose = model.body(one.root).photo_pose
+    elements = {one.root: _add_body(world, model.body(one.root), model, (pose.position_m, pose.quat_wxyz), one.base)}
+    for joint in one.joints:
+        place = (joint.position_m, joint.quat_wxyz)
+        element = elements[joint.link] = _add_body(elements[joint.parent], model.body(joint.link), model, place, "link")
+        if joint.kind == "fixed":
+            continue
+        numbers = {"damping": joint.damping, "frictionloss": joint.friction, "armature": joint.armature}
+        made = ET.SubElement(element, "joint", name=joint.name, type=joint.kind, axis=_text(joint.axis))
+        made.attrib.update({name: _text(value) for name, value in numbers.items()})
+        if joint.lower is not None or joint.upper is not None:
+            low = -FAR if joint.lower is None else joint.lower
+            high = FAR if joint.upper is None else joint.upper
+            made.set("range", _text((low, high)))
+
+
+def _add_body(
+    parent: ET.Element, body: BodyModel, model: Model, place: tuple[Sequence[float], Sequence[float]], motion: str
+) -> ET.Element:
+    """Add a body at a place in its parent, and return it."""
+    element = ET.SubElement(parent, "body", name=body.name, pos=_text(place[0]), quat=_text(place[1]))
+    if motion == "driven":
         element.set("mocap", "true")
-    elif body.motion == "free":
+    elif motion == "free":
         ET.SubElement(element, "freejoint", name=f"{body.name}_free")
-    if body.motion != "fixed":
+    if motion != "fixed":
         inertia = _text(body.inertia_kg_m2)
         ET.SubElement(element, "inertial", pos=_text(body.com_m), mass=_text(body.mass_kg), fullinertia=inertia)
     spheres = model.collision.get(body.name)
@@ -236,6 +275,7 @@ def _add_body(world: ET.Element, body: BodyModel, model: Model) -> None:
             geom.attrib.update(type="box", size=_text(body.shape.box.half_extents_m))
         elif body.shape.sphere is not None:
             geom.attrib.update(type="sphere", size=_text(body.shape.sphere.radius_m))
+    return element
 
 
 def _add_keyframe(root: ET.Element, file: ModelFile, keyframe: Keyframe) -> None:

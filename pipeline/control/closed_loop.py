@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ...datasets.capture.cameras import Camera
+from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import Model
 from ...schemas import InputDataError, NotConvergedError, UsageError
 from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
@@ -79,6 +80,7 @@ class ClosedLoop:
     ) -> None:
         if not 0 < control_dt_s < float("inf"):
             raise UsageError(f"a control interval of {control_dt_s:g} s.", "above 0 s.")
+        refuse_joints(model.file.articulations, model.place, "ClosedLoop")
         world = World.from_model(model, dtype, device)
         self._world, self._cuda = world, world.gravity.is_cuda
         self._times = torch.tensor([[0.0, control_dt_s]], dtype=torch.float64)

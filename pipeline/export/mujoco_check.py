@@ -103,6 +103,36 @@ def resimulate(model: Model, mjcf: str, start: Start, duration_s: float) -> Devi
     )
 
 
+def link_deviation(model: Model, mjcf: str, seed: int) -> tuple[float, float]:
+    """Return how far links of jointed bodies are in MuJoCo from where they are here, at random values of the joints.
+
+    Returns:
+        The largest distance of their origins [mm], and the largest angle between them [deg].
+    """
+    rng, world = np.random.default_rng(seed), World.from_model(model, torch.float64)
+    loaded = mujoco.MjModel.from_xml_string(mjcf)
+    data = mujoco.MjData(loaded)
+    expected = {}
+    for chain in world.chains:
+        place = model.body(chain.root).photo_pose
+        position, quat = np.array(place.position_m), np.array(place.quat_wxyz)
+        if chain.base == "free":
+            position, quat = rng.normal(size=3), rng.normal(size=4)
+            quat /= np.linalg.norm(quat)
+            data.joint(f"{chain.root}_free").qpos[:] = (*position, *quat)
+        low, high = (chain.numbers(name)[0].numpy() for name in ("lower", "upper"))
+        values = rng.uniform(low.clip(-1.0), high.clip(max=1.0))
+        for name, value in zip(chain.joint_names, values, strict=True):
+            data.joint(name).qpos[0] = value
+        rows = [torch.as_tensor(row)[None] for row in (position, quat, values)]
+        poses = [x[0].numpy() for x in chain.poses(rows[0], rows[1], rows[2])]
+        expected |= {name: (poses[0][k], poses[1][k]) for k, name in enumerate(chain.links)}
+    mujoco.mj_kinematics(loaded, data)
+    moved = [np.linalg.norm(data.body(name).xpos - place) for name, (place, _) in expected.items()]
+    turns = [np.abs(data.body(name).xquat @ quat).clip(0, 1) for name, (_, quat) in expected.items()]
+    return 1e3 * float(max(moved)), float(np.degrees(2 * np.arccos(min(turns))))
+
+
 def _mujoco_poses(
     model: Model, mjcf: str, driven: dict[str, Track], times_s: np.ndarray, names: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,6 @@ from ...datasets.io.atomic import new_file
 from ...datasets.io.kinds import Kind, kind_of, refuse_other_kind
 from ...datasets.io.outputs import DirectoryKind, FileKind, may_repeat, reads, refuse_output
 from ...datasets.io.progress import note
-from ...datasets.models.joints import refuse_joints
 from ...datasets.models.mjcf import write_mjcf
 from ...datasets.models.model import Model, read_model
 from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
@@ -47,6 +46,7 @@ NERFSTUDIO_NOTE = (
     "--auto-scale-poses False"
 )
 NO_TURNING = "in the .ply and .glb the bodies keep the light of the photos, whatever their orientation"
+NO_START = "the model has jointed bodies: the MJCF has no start, and no motion of it was compared, only places of links"
 NO_DRIVEN = "driven bodies are mocap bodies, whose velocity MuJoCo's friction ignores"
 
 
@@ -169,11 +169,17 @@ def _selected(thing: Path, options: ExportOptions) -> Selection:
 
 
 def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
-    from .mujoco_check import AFTER_CONTACT_S, keyframe_of, resimulate, start_of
+    from .mujoco_check import AFTER_CONTACT_S, keyframe_of, link_deviation, resimulate, start_of
 
     if not LEAST_DURATION_S <= options.duration_s <= MOST_DURATION_S:
         raise UsageError(f"--duration {options.duration_s:g} s.", f"{LEAST_DURATION_S:g} to {MOST_DURATION_S:g} s.")
     model = _simulated(thing)
+    if model.file.articulations:
+        text = write_mjcf(model, source=f"cgwm, of {model.file.provenance.capture}")
+        away_mm, away_deg = link_deviation(model, text, options.seed)
+        with new_file(out, "MJCF file", overwrite) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        return {"deviation_of_links_mm": away_mm, "deviation_of_links_deg": away_deg}, [NO_START]
     note("export: the same motion in MuJoCo")
     start = start_of(model, options.seed, options.duration_s)
     text = write_mjcf(model, keyframe=keyframe_of(start), source=f"cgwm, of {model.file.provenance.capture}")
@@ -246,7 +252,6 @@ def object_model(model: Model, name: str) -> ObjectModel:
 
 def _simulated(thing: Path) -> Model:
     model = read_model(thing)
-    refuse_joints(model.file.articulations, str(thing), "export --to mjcf")
     lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
     if lacking or model.file.contact is None:
         what = f"the body '{lacking[0]}' has no collision spheres" if lacking else "its physics are not fitted"

@@ -80,6 +80,13 @@ def contactnets_pt(root: Path) -> None:
     test_contactnets.write_pt(root / "tosses", [0, 1, 2])
 
 
+def elbow(root: Path) -> None:
+    """Write tosses of two links with a hinge."""
+    from helpers.elbow import write_tosses
+
+    write_tosses(root / "elbow", [0, 1, 2])
+
+
 def pinwm(root: Path) -> None:
     """Write pushes as PIN-WM publishes them."""
     from datasets.importers import test_pinwm

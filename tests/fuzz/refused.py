@@ -206,6 +206,8 @@ _PUSH = "pushes/dataset/push_a/dynamic_train0.json"
 _PINWM = ("pinwm", "pinwm pushes --train 4")
 _THROWS = ("jugglebot", "jugglebot throws --only b")
 _DROPS = ("balldrops", "balldrops drops")
+_ELBOW = ("elbow", "elbow elbow")
+_URDF = "elbow/elbow.urdf"
 _NET = "contactnets tosses --train 2 --test 1"
 IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("csv: times in ms", "csv", "csv csv", lambda root: _csv(root, "t", 1000)),
@@ -248,6 +250,10 @@ IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("balldrops: a height of text", *_DROPS, text("drops/ball_drops.csv", ",48.0,", ",high,")),
     ("balldrops: a time twice", *_DROPS, text("drops/ball_drops.csv", "0.06666666666666667", "0.0")),
     ("contactnets: pickled objects", "contactnets npz", _NET, lambda root: _pickled(root / "tosses/a.npz")),
+    ("elbow: a pickle as .pt", *_ELBOW, lambda root: _pickled(root / "elbow/tosses/0.pt")),
+    ("elbow: a mimic joint", *_ELBOW, text(_URDF, "</joint>", '<mimic joint="a"/></joint>')),
+    ("elbow: a loop", *_ELBOW, text(_URDF, '<child link="lower"/>', '<child link="upper"/>')),
+    ("elbow: no XML", *_ELBOW, written(_URDF, "<robot>")),
     ("contactnets: a pickle as .pt", "contactnets pt", _NET, lambda root: _pickled(root / "tosses/0.pt")),
 )  # fmt: skip
 

@@ -27,6 +27,7 @@ from .recordings import (
     contactnets_npz,
     contactnets_pt,
     csv,
+    elbow,
     hdf5,
     jugglebot,
     pinwm,
@@ -243,6 +244,7 @@ SUBJECTS = {
         Subject(
             "contactnets pt", "importers", contactnets_pt, imports("contactnets tosses --train 2 --test 1"), weight=0.5
         ),
+        Subject("elbow", "importers", elbow, imports("elbow elbow"), weight=0.5),
         Subject("pinwm", "importers", pinwm, imports("pinwm pushes --train 4"), weight=0.5),
         Subject("jugglebot", "importers", jugglebot, imports("jugglebot throws"), weight=0.5),
         Subject("tosses", "captures", write_toss_capture, (), weight=0),
