@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -250,7 +251,7 @@ IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("balldrops: a height of text", *_DROPS, text("drops/ball_drops.csv", ",48.0,", ",high,")),
     ("balldrops: a time twice", *_DROPS, text("drops/ball_drops.csv", "0.06666666666666667", "0.0")),
     ("contactnets: pickled objects", "contactnets npz", _NET, lambda root: _pickled(root / "tosses/a.npz")),
-    ("elbow: a pickle as .pt", *_ELBOW, lambda root: _pickled(root / "elbow/tosses/0.pt")),
+    ("elbow: a pickle as .pt", *_ELBOW, written("elbow/tosses/0.pt", pickle.dumps({"a": 1}))),
     ("elbow: a mimic joint", *_ELBOW, text(_URDF, "</joint>", '<mimic joint="a"/></joint>')),
     ("elbow: a loop", *_ELBOW, text(_URDF, '<child link="lower"/>', '<child link="upper"/>')),
     ("elbow: no XML", *_ELBOW, written(_URDF, "<robot>")),
