@@ -247,8 +247,8 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             'name = "tip"\n',
             'name = "tip"\nmass = 0.3\n',
             "C/capture.toml, line 6: [[bodies]] 'tip' has an unknown field 'mass'.\n"
-            "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, material, photo_box. "
-            "Did you mean 'mass_kg'?\n"
+            "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, material, face_points, "
+            "photo_box. Did you mean 'mass_kg'?\n"
             "Next: correct the field.",
         ),
         (
@@ -263,7 +263,8 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             'name = "cube"\n',
             "mass_kg = 1.0\n",
             "C/capture.toml, line 2: [[bodies]] lacks the field 'name'.\n"
-            "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, material, photo_box.\n"
+            "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, material, face_points, "
+            "photo_box.\n"
             "Next: correct the field.",
         ),
         (
