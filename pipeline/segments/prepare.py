@@ -287,9 +287,11 @@ def _remove_outliers(state: _State) -> None:
 def _remove_held_starts(state: _State) -> None:
     """Fit the flights, and leave out first frames in which a hand still touches the body, until none is found."""
     state.fit_flights()
-    while state.fitted is not None and (found := held_starts(state.fitted, state.observations)):
+    turned: set[int] = set()
+    while state.fitted is not None and (found := held_starts(state.fitted, state.observations, turned)):
         # frames in the hand inflated the noise, which then hid other wrong frames
         state.held |= found
+        turned |= set(found)
         state.observations = without_held(state.observations, state.held)
         state.measure_noise(cut_episodes(state.world, state.observations, state.noise, state.touched)[0], [])
         flight = cut_episodes(state.world, state.observations, state.noise, state.touched)[0]

@@ -12,7 +12,7 @@ all flights share.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -35,20 +35,23 @@ if TYPE_CHECKING:
     from ..physics.world import World
 
 
-def held_starts(flight: Segments, whole: Observations) -> dict[int, int]:
+def held_starts(flight: Segments, whole: Observations, known: Collection[int] = ()) -> dict[int, int]:
     """Return the first free frame of each episode that begins in a hand, by index of the episode.
 
     Args:
         flight: All flights, with fitted states.
         whole: The episodes that they are cut from.
+        known: Episodes of which this was found before, with a noise that frames in a hand had inflated: without that
+            part, what is left of them may still not be free flight.
     """
     share = _rotation_chi2(flight)
-    known = torch.isfinite(share)
-    if not bool(known.any()):
+    measured = torch.isfinite(share)
+    if not bool(measured.any()):
         return {}
-    usual = max(float(share[known].median()), 1.0)
+    usual = max(float(share[measured].median()), 1.0)
+    least = torch.tensor([LIMITS.free_chi2 if item.episode in known else LIMITS.held_chi2 for item in flight.items])
     found: dict[int, int] = {}
-    for place in torch.nonzero(known & (share > LIMITS.held_chi2 * usual))[:, 0].tolist():
+    for place in torch.nonzero(measured & (share > least.to(share) * usual))[:, 0].tolist():
         item = flight.items[place]
         count = item.last - item.first + 1
         counts = range(1, min(count // 2, count - LIMITS.least_free) + 1)
