@@ -13,6 +13,7 @@ from cgwm.pipeline.geometry.rotation import geodesic_angle
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters
 from cgwm.pipeline.physics.rollout import simulate
 from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.segments.release_detection import from_releases
 from cgwm.pipeline.trajectories.initial_state import clearance, estimate_states, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations, track_episodes
 from cgwm.pipeline.trajectories.residuals import retract
@@ -52,6 +53,7 @@ class Account:
         """Estimate the states of a split's tosses by the model, from their warm-ups; of the first `most` of them."""
         episodes = track_episodes(capture, split)[:most]
         noise = estimate_noise([track for _, tracks in episodes for track in tracks.values()])
+        episodes, _ = from_releases(world, episodes, noise)  # as `cgwm eval`
         observations = Observations.of(world, episodes, [(-np.inf, np.inf)] * len(episodes))
         warm = warmup_frames(world, observations, WARMUP_S)
         observations, solution = estimate_states(world, observations, warm, noise)

@@ -1,6 +1,7 @@
 """The stage evaluate (`cgwm eval`): compare open-loop predictions of a model with measurements.
 
-The initial state of an episode is estimated from its warm-up with the model; the prediction uses no later data.
+The initial state of an episode is estimated from its warm-up with the model; the prediction uses no later data. An
+episode that begins in a hand begins at its release, as for `fit` and `diagnose`.
 Errors are averaged within an episode first, then over episodes.
 """
 
@@ -28,6 +29,7 @@ from ..runtime.device import resolve_device
 from ..runtime.resources import enough_memory, one_torch_thread
 from ..segments.group_parameters import group_parameters, with_known_groups
 from ..segments.random_effects import with_fitted_groups
+from ..segments.release_detection import from_releases
 from ..trajectories.track_noise import Noise, estimate_noise
 from .episode_errors import episode_errors, video_mean, within
 from .image_errors import VideoComparison, VideoErrors
@@ -130,6 +132,9 @@ def evaluate_model(
             "tracks/<episode>.csv with rows for every free and driven body.",
             "add tracks, or name another split with --split.",
         )
+    noise = _noise(model, capture, episodes)
+    episodes, held = _released(world, episodes, noise)
+    warnings += held
     cameras = {} if brief else _cameras(model, capture, [name for name, _ in episodes], warnings)
     videos = (
         VideoErrors(model=model, capture=capture, device=str(resolve_device(device)), keep_frames=keep_frames)
@@ -137,7 +142,6 @@ def evaluate_model(
         else None
     )
     video_times = [_video_times(capture, name, cameras.get(name, [])) for name, _ in episodes]
-    noise = _noise(model, capture, episodes)
     fits = 0 if brief else STATE_FIT_EPISODES
     world, fitted = _worlds_with_random_effects(world, model, capture, episodes, noise, warnings, brief)
     predictions = _predict(model, world, episodes, noise, warmup_s, video_times, fits, fitted)
@@ -206,6 +210,12 @@ def _stored_tracks(reader: RolloutReader, number: int) -> dict[str, Track]:
     return {
         name.decode(): Track(time, position[:, k], quat[:, k]) for k, name in enumerate(names) if motions[k] != b"fixed"
     }
+
+
+@one_torch_thread()
+def _released(world: World, episodes: Sequence[Episode], noise: Noise) -> tuple[list[Episode], list[str]]:
+    """Return the episodes, those that begin in a hand from their releases on, and warnings about these."""
+    return from_releases(world, episodes, noise)
 
 
 def check_bodies(model: Model, names: Sequence[str], target: str) -> None:

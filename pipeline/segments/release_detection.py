@@ -91,6 +91,17 @@ def find_releases(
     return released_s, release_warnings(released_s, {episodes[k][0]: float(whole.times_s[k, 0]) for k in held})
 
 
+def from_releases(
+    world: World, episodes: Sequence[Episode], noise: tuple[float | None, float | None]
+) -> tuple[list[Episode], list[str]]:
+    """Return the episodes, those that begin in a hand from their releases on, and warnings about these.
+
+    Jointed bodies have none: the detection takes the flight of a single body. Arguments as of `find_releases`.
+    """
+    released_s, warnings = ({}, []) if world.chains else find_releases(world, episodes, noise)
+    return after_release(episodes, released_s), warnings
+
+
 def without_held(whole: Observations, held: Mapping[int, int]) -> Observations:
     """Return the episodes with the frames before each release (`held`, by episode) marked as not measured."""
     seen, turned = whole.seen.clone(), whole.has_orientation.clone()

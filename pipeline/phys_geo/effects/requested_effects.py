@@ -11,7 +11,7 @@ from ....schemas import EffectModel, FittedParameter, InputDataError, PhysConfig
 from ...physics.effects.registry import effect_of, split_units
 from ...physics.effects.trust import trust_effects
 from ...physics.world import World
-from ...segments.release_detection import after_release, find_releases
+from ...segments.release_detection import from_releases
 from ..tracks.contact_fit import fit_physics
 from ..tracks.contact_result import PhysicsFit
 from ..tracks.earlier_estimates import EarlierEstimates
@@ -111,9 +111,7 @@ def fit_with_effects(
         NotConvergedError: If every rollout diverges.
     """
     _require_needs(world, episodes)
-    # the detection of hands takes the flight of a single body
-    released_s, warnings = ({}, []) if world.chains else find_releases(world, episodes, noise)
-    thrown = after_release(episodes, released_s)
+    thrown, warnings = from_releases(world, episodes, noise)
     found = fit_physics(world, thrown, config, noise, warm_started, groups, earlier, medians, force_std_n)
     return replace(found, warnings=(*found.warnings, *warnings))
 
