@@ -326,6 +326,7 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
                 shape=body.shape,
                 material=body.material,
                 face_points=body.face_points,
+                face_exponent=body.face_exponent,
                 collision_distance_m=found.collision_distance_m,
                 radius_factor=scene.radius_factor,
                 convex=fills_hull(

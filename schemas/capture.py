@@ -16,6 +16,7 @@ from .quantities import (
     Coordinate,
     DampingRatio,
     Deviation,
+    FaceExponent,
     FacePoints,
     FrameRate,
     Friction,
@@ -160,6 +161,9 @@ class Body(FileModel):
     face_points: FacePoints = 0
     """Least number of points on each flat face of a convex body, by which the ground carries it as a plate; 0: by its
     corners alone, as it suffices where it tumbles."""
+    face_exponent: FaceExponent = 0.0
+    """Power of the distance from the middle of its face by which a point carries more [1]: 0 for an even elastic layer,
+    about 2 for a stiff plate, which rests on its corners."""
     photo_box: PhotoBox | None = None
     """Where the body is in photos without masks; left out: found on the ground (stage SG-GS)."""
 

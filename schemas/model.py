@@ -15,6 +15,7 @@ from .quantities import (
     ContactTime,
     DampingRatio,
     Deviation,
+    FaceExponent,
     FacePoints,
     Friction,
     Gravity,
@@ -154,6 +155,8 @@ class BodyModel(FileModel):
     """Whether the body fills the convex hull of its colliding spheres; other bodies then touch that hull."""
     face_points: FacePoints = 0
     """Least number of points on each flat face by which the ground carries it as a plate; 0: by its corners alone."""
+    face_exponent: FaceExponent = 0.0
+    """Power of the distance from the middle of its face by which a point carries more [1]; 0: alike."""
 
     @field_validator("inertia_kg_m2")
     @classmethod

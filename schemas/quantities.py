@@ -36,6 +36,8 @@ Deviation = Annotated[float, Field(ge=1e-12, le=1e6)]
 """Standard deviation of a measurement, in its unit."""
 FacePoints = Annotated[int, Field(ge=0, le=1000)]
 """Number of points on a face."""
+FaceExponent = Annotated[float, Field(ge=0, le=20)]
+"""Power of the distance from the middle of a face by which its points carry more [1]."""
 Friction = Annotated[float, Field(ge=0, le=100)]
 """Coulomb coefficient [1]."""
 ContactTime = Annotated[float, Field(ge=1e-7, le=10)]

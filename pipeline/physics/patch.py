@@ -6,8 +6,12 @@ between them. So each flat face gets points with equal parts of its area, by the
 polynomials of degree 2 on each triangle of its hull (Hammer and Stroud, 1956), and a contact's share of the load is
 proportional to its area: the pressure is that of an even elastic layer (Winkler), linear in the place.
 
-Assumptions: the face is even, its pressure smooth; unevenness of a real face, which may rest on its rim or its middle,
-is not modelled. Planes and the ground touch patches; other bodies and surfaces touch the hull.
+A real face may press more at its rim than in its middle, as a stiff plate on a soft ground does. An exponent g makes
+the layer stiffer with the distance from the middle of the face, by its g-th power: 0 is the even layer, 2 raises the
+second moment of the pressure of a disc by a third, and a large one leaves the farthest corners alone. What resists
+turning is above all the mean distance of the load from the middle, which this one number sets.
+
+Planes and the ground touch patches; other bodies and surfaces touch the hull.
 """
 
 from __future__ import annotations
@@ -22,6 +26,8 @@ from .hull import SAME_NORMAL, SAME_PLANE_M, Hull
 
 CORNER_SHARE = 1e-3
 """Area of a support of the hull, in units of the smallest area of a point: it counts only where no face lies flat."""
+LEAST_CARRIED = 1e-3
+"""Least that a point carries for its area, in units of what the farthest point from the middle does."""
 LEAST_FACE = 0.02
 """Smallest area of a face that gets points, in units of the hull's whole surface: facets of curved sides have less."""
 _RULE = torch.tensor([[4.0, 1, 1], [1, 4, 1], [1, 1, 4]], dtype=torch.float64) / 6
@@ -36,10 +42,10 @@ class Patch:
     shares: Tensor
     """Barycentric coordinates, shape (P, 3)."""
     areas: Tensor
-    """Area of each point, 1 for the largest face in all, shape (P,)."""
+    """Area of each point, 1 for the largest face in all, shape (P,); with an exponent what it carries of that."""
 
     @staticmethod
-    def of(hull: Hull, centers: Tensor, radii: Tensor, least: int) -> Patch | None:
+    def of(hull: Hull, centers: Tensor, radii: Tensor, least: int, exponent: float = 0.0) -> Patch | None:
         """Spread at least `least` points over each flat face of a hull; None where no face is large.
 
         Args:
@@ -47,6 +53,7 @@ class Patch:
             centers: Centres of all spheres of the body [m], shape (N, 3).
             radii: Their radii [m], shape (N,).
             least: Least number of points of a face.
+            exponent: Power of the distance from the middle of its face by which a point carries more [1].
         """
         triangles = _triangles(hull, centers, radii)
         areas, faces = _areas(hull, centers, radii, triangles), _coplanar(hull)
@@ -56,7 +63,9 @@ class Patch:
             members = torch.nonzero(faces == face).flatten()
             rule = _refined(math.ceil(math.sqrt(least / (3 * len(members))))).to(centers)
             size = (areas[members] / len(rule)).repeat_interleave(len(rule))
-            parts.append((triangles[members].repeat_interleave(len(rule), 0), rule.repeat(len(members), 1), size))
+            corners, shares = triangles[members].repeat_interleave(len(rule), 0), rule.repeat(len(members), 1)
+            places = (centers[corners] * shares[..., None]).sum(1)
+            parts.append((corners, shares, _carried(places, size, exponent)))
         if not parts:
             return None
         corners, shares, sizes = (torch.cat(each) for each in zip(*parts, strict=True))
@@ -91,6 +100,15 @@ def _areas(hull: Hull, centers: Tensor, radii: Tensor, triangles: Tensor) -> Ten
     touched = centers[triangles] + radii[triangles][..., None] * hull.faces[:, None, :3]
     sides = touched[:, 1:] - touched[:, :1]
     return 0.5 * torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=-1)
+
+
+def _carried(places: Tensor, areas: Tensor, exponent: float) -> Tensor:
+    """Return what points (P, 3) of a face with areas (P,) carry of its area: more far from its middle."""
+    if exponent == 0:
+        return areas
+    away = (places - (areas[:, None] * places).sum(0) / areas.sum()).norm(dim=-1)
+    carried = areas * ((away / away.max()) ** exponent).clamp_min(LEAST_CARRIED)
+    return carried * (areas.sum() / carried.sum())
 
 
 def _coplanar(hull: Hull) -> Tensor:

@@ -399,7 +399,7 @@ def _patch(entry: BodyModel, hull: Hull | None, centers: Tensor, radii: Tensor) 
     """
     if entry.face_points == 0:
         return None
-    found = None if hull is None else Patch.of(hull, centers, radii, entry.face_points)
+    found = None if hull is None else Patch.of(hull, centers, radii, entry.face_points, entry.face_exponent)
     if found is None:
         reason = "no flat face" if entry.convex else "a shape that does not fill its convex hull"
         raise InputDataError(

@@ -35,14 +35,20 @@ def box_body(half: tuple[float, float, float] = (0.05, 0.04, 0.03), mass: float 
     )
 
 
-def plate_body(half: tuple[float, float, float], mass: float = 0.4, points: int = 12, radius: float = 5e-4) -> Body:
+def plate_body(
+    half: tuple[float, float, float],
+    mass: float = 0.4,
+    points: int = 12,
+    radius: float = 5e-4,
+    exponent: float = 0.0,
+) -> Body:
     """Return a box with points spread over its faces, at least `points` each."""
     body = box_body(half, mass, radius)
     centers, radii = body.centers[0], body.radii[0]
     supports = plane_contacts(centers, radii)
     hull = Hull.of(centers, radii, supports)
     assert hull is not None
-    return replace(body, on_plane=supports, hull=hull, patch=Patch.of(hull, centers, radii, points))
+    return replace(body, on_plane=supports, hull=hull, patch=Patch.of(hull, centers, radii, points, exponent))
 
 
 def ball_body(radius: float = 0.04, mass: float = 0.2, name: str = "ball", copies: int = 1) -> Body:

@@ -248,7 +248,7 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             'name = "tip"\nmass = 0.3\n',
             "C/capture.toml, line 6: [[bodies]] 'tip' has an unknown field 'mass'.\n"
             "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, material, face_points, "
-            "photo_box. Did you mean 'mass_kg'?\n"
+            "face_exponent, photo_box. Did you mean 'mass_kg'?\n"
             "Next: correct the field.",
         ),
         (
@@ -264,7 +264,7 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             "mass_kg = 1.0\n",
             "C/capture.toml, line 2: [[bodies]] lacks the field 'name'.\n"
             "Allowed: name, motion, mass_kg, inertia_kg_m2, com_m, shape, photo_pose, material, face_points, "
-            "photo_box.\n"
+            "face_exponent, photo_box.\n"
             "Next: correct the field.",
         ),
         (

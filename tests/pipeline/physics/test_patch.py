@@ -11,11 +11,9 @@ from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.impulse_solver import _share, _share_by_area
 from cgwm.schemas import InputDataError
+from helpers.quasi_static_plate import Push
 from helpers.small_model import small_model
 from helpers.worlds import F64, ball_body, batch, box_body, law, plate_body, state_of, times, world_of
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 G = 9.81
 UP = (1.0, 0.0, 0.0, 0.0)
@@ -23,16 +21,16 @@ HALF, RADIUS, FINGER_M, FRICTION, TAU = 0.05, 5e-4, 0.005, 0.3, 0.003
 STROKE_M, SPEED_M_S = 0.02, 0.02
 
 
-def of_finger(points: int) -> World:
+def of_finger(points: int, exponent: float) -> World:
     """A square plate, without points carried by its corners alone, and a finger without friction."""
-    box = plate_body((HALF, HALF, 0.01), points=max(points, 1), radius=RADIUS)
+    box = plate_body((HALF, HALF, 0.01), points=max(points, 1), radius=RADIUS, exponent=exponent)
     box = replace(box, material="plate", patch=box.patch if points else None)
     finger = replace(ball_body(FINGER_M, name="finger"), motion="driven", material="finger")
     world = world_of(box, finger, contact=law(FRICTION, TAU, 0.7), step_s=0.001)
     return replace(world, pair_laws={("finger", "plate"): law(1e-6, TAU, 0.7)})
 
 
-def turn_of_plate(offset_m: float, points: int) -> float:
+def turn_of_plate(offset_m: float, points: int, exponent: float = 0.0) -> float:
     """Return by how much the engine's plate turns [rad] as a finger pushes it beside its middle."""
     end = 0.1 + STROKE_M / SPEED_M_S
     first = -HALF - FINGER_M
@@ -40,72 +38,38 @@ def turn_of_plate(offset_m: float, points: int) -> float:
     track = Track(np.array([0, 0.1, end]), path, np.tile(UP, (3, 1)))
     resting = ((0, 0, 0.01 - G * TAU**2), UP, (0, 0, 0), (0, 0, 0))
     start = state_of(resting, (tuple(path[0]), UP, (0,) * 3, (0,) * 3))
-    rollout = roll_out(of_finger(points), start, torch.tensor([0, end], dtype=F64), {"finger": track})
+    rollout = roll_out(of_finger(points, exponent), start, torch.tensor([0, end], dtype=F64), {"finger": track})
     w, _, _, z = rollout.quat_wxyz[0, -1, 0].tolist()
     return 2 * math.atan2(z, w)
 
 
-def slowest(points: Array, pressure: Array, arm: Array, found: Array) -> tuple[Array, Array]:
-    """Return the twist (vx, vy, w) of a plate whose point `arm` moves at 1 along x, and its friction force.
-
-    Coulomb friction at every point, quasi-static: the twist takes the least power of all that have this speed. Newton's
-    method from `found`.
-    """
-    x, y = points.T
-    across = np.stack([0 * x, arm[1] - y], 1), np.stack([1 + 0 * x, x], 1)
-    to_point = np.stack(across, 1)
-
-    def slip(twist: Array) -> Array:
-        return to_point @ twist + np.array([1.0, 0.0])
-
-    def power(twist: Array) -> float:
-        return float(pressure @ np.linalg.norm(slip(twist), axis=1))
-
-    for _ in range(50):
-        u = slip(found)
-        size = np.sqrt((u**2).sum(1) + 1e-12)
-        e = u / size[:, None]
-        slope = np.einsum("p,pc,pck->k", pressure, e, to_point)
-        bent = (np.eye(2) - e[:, :, None] * e[:, None]) * (pressure / size)[:, None, None]
-        move = -np.linalg.solve(np.einsum("pck,pcd,pdl->kl", to_point, bent, to_point), slope)
-        k = 1.0
-        while power(found + k * move) > power(found) and k > 1e-6:
-            k /= 2
-        found = found + k * move
-        if np.abs(move).max() < 1e-8:
-            break
-    return found, pressure @ (slip(found) / np.linalg.norm(slip(found), axis=1)[:, None])
-
-
-def turn_of_mesh(offset_m: float) -> float:
-    """Return the turn [rad] of a finely meshed plate, integrated with the second order.
-
-    Its pressure is even but for the moment of the finger's height, which makes it linear.
-    """
-    half, cells, steps = HALF - RADIUS, 40, 100
-    ticks = (np.arange(cells) + 0.5) / cells * 2 * half - half
-    points = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), -1).reshape(-1, 2)
-    pose, force, found, last = np.zeros(3), np.array([FRICTION, 0.0]), np.array([0.0, 5.0]), None
-    for k in range(steps):
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        touched = np.array([-HALF - FINGER_M + STROKE_M * k / steps, offset_m]) + FINGER_M * np.array([c, s])
-        arm = np.array([[c, s], [-s, c]]) @ (touched - pose[:2])
-        tilt = FINGER_M * math.hypot(*force) * points[:, 0] / (half**2 / 3)
-        found, friction = slowest(points, (1 + tilt) / len(points), arm, found)
-        force = FRICTION * friction
-        speed = STROKE_M / steps * c
-        vx, vy, w = speed * (1 + found[1] * arm[1]), speed * found[0], speed * found[1]
-        move = np.array([c * vx - s * vy, s * vx + c * vy, w])
-        pose = pose + (move if last is None else 1.5 * move - 0.5 * last)
-        last = move
-    return float(pose[2])
+def pushed(offset_m: float, exponent: float = 0.0) -> Push:
+    """Return the same push for the reference."""
+    return Push(
+        half_m=HALF,
+        flat_m=HALF - RADIUS,
+        finger_m=FINGER_M,
+        offset_m=offset_m,
+        stroke_m=STROKE_M,
+        friction=FRICTION,
+        exponent=exponent,
+    )
 
 
 @pytest.mark.parametrize("offset_m", [0.012, pytest.param(0.03, marks=pytest.mark.evidence)])
 def test_a_plate_pushed_beside_its_middle_turns_as_a_finely_meshed_one(offset_m: float) -> None:
-    expected = turn_of_mesh(offset_m)
+    expected = pushed(offset_m).turn_of_mesh()
     assert abs(turn_of_plate(offset_m, 12) / expected - 1) < 0.01
     assert abs(turn_of_plate(offset_m, 0) / expected - 1) > 0.3  # four corners resist the turn twice as much
+    # the ellipsoid through the same largest force and torque is no plate: beside the middle it resists more
+    assert 0.7 < pushed(offset_m).turn_of_ellipsoid() / expected < 0.95
+
+
+@pytest.mark.parametrize("exponent", [2.0, pytest.param(4.0, marks=pytest.mark.evidence)])
+def test_a_plate_that_presses_more_at_its_rim_turns_less(exponent: float) -> None:
+    expected = pushed(0.012, exponent).turn_of_mesh()
+    assert abs(turn_of_plate(0.012, 48, exponent) / expected - 1) < 0.01
+    assert abs(expected / pushed(0.012).turn_of_mesh()) < 0.85
 
 
 def test_points_have_the_area_and_the_second_moments_of_the_faces() -> None:
@@ -126,6 +90,21 @@ def test_points_have_the_area_and_the_second_moments_of_the_faces() -> None:
             spread = (area[:, None] * points[on][:, others].square()).sum(0) / area.sum()
             torch.testing.assert_close(mean, 0 * mean, atol=1e-12, rtol=0)
             torch.testing.assert_close(spread, flat[others].square() / 3)
+
+
+def test_an_exponent_moves_the_load_to_the_rim_and_keeps_its_sum() -> None:
+    """With the exponent 2 the second moment of a square grows by <r^4> / <r^2>^2 = (2/5 + 2/9) / (2/3)^2."""
+    even, more = (plate_body((0.05, 0.05, 0.03), points=192, exponent=g) for g in (0.0, 2.0))
+    assert even.patch is not None and more.patch is not None
+    points = even.patch.centers(even.centers)[0]
+    low = (points[:, 2] + 0.0295).abs() < 1e-9
+    away = points[low, :2].square().sum(-1)
+    first, second = even.patch.areas[low], more.patch.areas[low]
+    torch.testing.assert_close(second.sum(), first.sum())
+    torch.testing.assert_close(second @ points[low, :2], torch.zeros(2, dtype=F64), atol=1e-12, rtol=0)
+    grown = float((second @ away) / (first @ away))
+    assert abs(grown / 1.4 - 1) < 2e-3
+    torch.testing.assert_close(second / first, away * (first.sum() / (first @ away)), rtol=1e-9, atol=1e-9)
 
 
 def test_a_spinning_plate_stops_after_the_torque_of_a_plate() -> None:
