@@ -364,8 +364,16 @@ def test_derivatives_of_a_toss(fused: Fused) -> None:
 
 def test_derivatives_of_a_box_whose_faces_are_plates(fused: Fused) -> None:
     first = [0, 0, 0.0295, 0.001, 0.002, 0.1, 0.5, 0.2, -0.1, 0.3, 0.2, 2]
-    plate = world_of(worlds.plate_body((0.05, 0.04, 0.03)))
+    plate = world_of(worlds.plate_body((0.05, 0.04, 0.03), exponent=2.0))
     agree_with_derivatives(fused, plate, first, times(0.04), None, 0.02)
+    # and those of differences of the kernel itself, which share no formula with it
+    inputs = torch.tensor([[*first, 0.3, 0.004, 0.4, 0.001, 0.002, -0.001, 0.003]], dtype=F64)
+    along = torch.linspace(-1, 1, inputs.shape[1], dtype=F64) * (inputs.abs() + 0.01)
+    places = torch.cat((inputs, inputs + 1e-6 * along, inputs - 1e-6 * along))
+    values, jacobian = (x.cpu() for x in batched_jacobian(of_parameters(fused, plate, times(0.04)), places))
+    slope = jacobian[0] @ along[0]
+    difference = (values[1] - values[2]) / 2e-6
+    torch.testing.assert_close(slope / slope.abs().amax(), difference / slope.abs().amax(), rtol=1e-6, atol=1e-6)
 
 
 def test_derivatives_of_bodies_that_touch(fused: Fused) -> None:
