@@ -13,8 +13,8 @@ from cgwm.schemas import InputDataError
 
 
 def text_of(pushes: int = 2) -> str:
-    """Pushes along x by a finger turned by -135 degrees, whose sensor so reads the force along its own x."""
-    half = np.deg2rad(-135.0) / 2
+    """Pushes along x by a finger turned by 135 degrees: its left-handed sensor reads the force along x and -y."""
+    half = np.deg2rad(135.0) / 2
     finger = f"{np.cos(half):.12f} 0 0 {np.sin(half):.12f}"
     one = ["562 139 9 1 0 0 0", "572 143 9 0.6 0 0 0.8", "3", "100.0 0.5 0.25", "101.0 0.5 0.25", "102.0 4.5 1.25"]
     one += ["3", *(f"{100 + k}.0 {500 + 10 * k} 30 21 {finger}" for k in range(3))]
@@ -41,7 +41,7 @@ def test_a_push_of_mlab(tmp_path: Path) -> None:
     np.testing.assert_allclose(tracks["object"].time_s, [0, 2])
     np.testing.assert_allclose(tracks["finger"].position_m[:, 0], [0.5, 0.51, 0.52])
     assert tracks["finger"].force_n is not None
-    np.testing.assert_allclose(tracks["finger"].force_n, [[0, 0, 0], [0, 0, 0], [4, 1, 0]], atol=1e-9)
+    np.testing.assert_allclose(tracks["finger"].force_n, [[0, 0, 0], [0, 0, 0], [4, -1, 0]], atol=1e-9)
 
 
 def test_a_push_of_mit(tmp_path: Path) -> None:
