@@ -14,6 +14,9 @@ _PUBLIC = {
     "CgwmError": ".schemas",
     "CheckFailedError": ".schemas",
     "ClosedLoop": ".pipeline.control",
+    "ControlPlan": ".pipeline.control",
+    "ControlState": ".pipeline.control",
+    "Controller": ".pipeline.control",
     "DamagedShardError": ".schemas",
     "InputDataError": ".schemas",
     "Model": ".datasets.models",
@@ -28,6 +31,7 @@ _PUBLIC = {
     "Velocity": ".pipeline.control",
     "calibrate": ".pipeline.calibrate",
     "compare": ".pipeline.compare",
+    "control": ".pipeline.control",
     "diagnose": ".pipeline.diagnose",
     "doctor": ".pipeline.runtime.doctor",
     "evaluate": ".pipeline.evaluate",
@@ -72,7 +76,7 @@ if TYPE_CHECKING:
     from .datasets.models import Model, read_model
     from .pipeline.calibrate import calibrate
     from .pipeline.compare import compare
-    from .pipeline.control import ClosedLoop, Reach, Velocity
+    from .pipeline.control import ClosedLoop, Controller, ControlPlan, ControlState, Reach, Velocity, control
     from .pipeline.demo import (
         run_demo,
         run_mystery,
@@ -112,6 +116,9 @@ __all__ = [
     "CgwmError",
     "CheckFailedError",
     "ClosedLoop",
+    "ControlPlan",
+    "ControlState",
+    "Controller",
     "DamagedShardError",
     "InputDataError",
     "Model",
@@ -127,6 +134,7 @@ __all__ = [
     "__version__",
     "calibrate",
     "compare",
+    "control",
     "diagnose",
     "doctor",
     "evaluate",

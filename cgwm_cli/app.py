@@ -8,6 +8,7 @@ import typer
 
 from .calibrate import calibrate
 from .compare import compare
+from .control import control
 from .demo import demo
 from .diagnose import diagnose
 from .doctor import doctor
@@ -33,9 +34,10 @@ VERBS = (
     ("compare", compare, "Compare models: where and when each fails."),
     ("diagnose", diagnose, "Find the effect that a model lacks."),
     ("improve", improve, "Fit, diagnose, add and refit until nothing helps."),
+    ("control", control, "Let a robot act through a model."),
     ("import", import_capture, "Convert recordings in another format to a capture."),
     ("export", export, "Convert a dataset or model to another tool's format."),
-    ("validate", validate, "Check a capture, model, dataset or ladder."),
+    ("validate", validate, "Check a capture, model, dataset, ladder or run."),
     ("doctor", doctor, "Report what this machine has and what would be used."),
 )
 

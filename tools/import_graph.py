@@ -23,8 +23,8 @@ PIPELINE: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("kernels", ("physics", "rendering")),
     ("kernels", ("trajectories",)),
     ("kernels", ("segments",)),
-    ("stages", ("calibrate", "sg_gs", "synthesize", "evaluate", "control", "diagnose", "validate")),
-    ("stages", ("phys_geo", "compare", "view", "export")),
+    ("stages", ("calibrate", "sg_gs", "synthesize", "evaluate", "diagnose", "validate")),
+    ("stages", ("phys_geo", "compare", "control", "view", "export")),
     ("chains", ("fit",)),
     ("chains", ("demo", "improve")),
 )

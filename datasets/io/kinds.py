@@ -1,4 +1,4 @@
-"""Detection of the kind of a directory: capture, model, dataset or ladder of models."""
+"""Detection of the kind of a directory: capture, model, dataset, ladder of models or run of a task of control."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ from typing import Literal
 
 from ...schemas import CAPTURE_FORMAT, InputDataError
 
-Kind = Literal["capture", "model", "dataset", "ladder"]
+Kind = Literal["capture", "model", "dataset", "ladder", "run"]
 
 _MARKS: dict[Kind, str] = {
     "capture": "capture.toml",
     "model": "model.json",
     "dataset": "dataset.json",
     "ladder": "improve.json",
+    "run": "control.json",
 }
 _USED_BY: dict[Kind, str] = {
     "capture": "cgwm calibrate, fit, compare and diagnose take one",
     "model": "cgwm synthesize, eval and compare take one",
     "dataset": "cgwm eval takes one as its target",
     "ladder": "cgwm validate takes one, the other commands one of its models",
+    "run": "cgwm validate takes one",
 }
 
 

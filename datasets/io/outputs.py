@@ -31,7 +31,7 @@ _HASHED_BYTES = 1 << 16
 _HEAD_BYTES = 1 << 12
 
 DirectoryKind = Literal[
-    "model", "dataset", "capture", "demo", "ladder", "LeRobot dataset", "BOP dataset", "nerfstudio capture",
+    "model", "dataset", "capture", "demo", "ladder", "run", "LeRobot dataset", "BOP dataset", "nerfstudio capture",
     "COLMAP model", "splat folder",
 ]  # fmt: skip
 FileKind = Literal[

@@ -1,5 +1,7 @@
-"""A fitted model as the environment of a controller: a command in, a frame and the state out, step by step."""
+"""A fitted model as the environment of a controller, and as the model by which one plans (`cgwm control`)."""
 
 from .closed_loop import ClosedLoop, Reach, Velocity
+from .controller import Controller, ControlPlan, ControlState
+from .stage import control
 
-__all__ = ["ClosedLoop", "Reach", "Velocity"]
+__all__ = ["ClosedLoop", "ControlPlan", "ControlState", "Controller", "Reach", "Velocity", "control"]

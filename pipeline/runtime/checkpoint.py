@@ -51,8 +51,8 @@ class Checkpoint:
         self._last = time.monotonic()
 
     @staticmethod
-    def beside(out: Path, made_of: Mapping[str, str], resume: bool, overwrite: bool) -> Checkpoint:
-        """Return the checkpoints of the fit that writes the model `out`; existing ones are kept if it resumes.
+    def beside(out: Path, made_of: Mapping[str, str], resume: bool, overwrite: bool, work: str = "a fit") -> Checkpoint:
+        """Return the checkpoints of the work that writes `out`; existing ones are kept if it resumes.
 
         Raises:
             UsageError: If the directory exists and holds no checkpoints, if it does and neither `resume` nor
@@ -76,7 +76,7 @@ class Checkpoint:
             checkpoint.remove()
         else:
             raise UsageError(
-                f"{path} holds a fit of {out} that was interrupted.",
+                f"{path} holds {work} of {out} that was interrupted.",
                 todo="pass --resume to go on with it, or --overwrite to begin again.",
             )
         return checkpoint

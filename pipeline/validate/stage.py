@@ -1,4 +1,4 @@
-"""The stage validate (`cgwm validate`): check that a capture, model, dataset or ladder of models is correct."""
+"""The stage validate (`cgwm validate`): check that a capture, model, dataset, ladder of models or run is correct."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from ...schemas.validation import ValidationReport
 def validate(
     thing: Path | str, sample: int | None = None, seed: int = 0, accept_units: bool = False
 ) -> ValidationReport:
-    """Check a capture, a model, a dataset, or the ladder of models of `cgwm improve`.
+    """Check a capture, a model, a dataset, the ladder of models of `cgwm improve`, or a run of `cgwm control`.
 
     Args:
-        thing: CAPTURE, MODEL, DATASET, or the directory of a ladder.
+        thing: CAPTURE, MODEL, DATASET, RUN, or the directory of a ladder.
         sample: Number of rollouts of a dataset to check, drawn at random; None checks all.
         seed: Seed of that draw.
         accept_units: Do not refuse units and frames of a capture that its motion contradicts.
@@ -36,7 +36,7 @@ def validate(
     """
     path = Path(thing)
     kind = kind_of(path)
-    if sample is not None and kind in ("capture", "model", "ladder"):
+    if sample is not None and kind in ("capture", "model", "ladder", "run"):
         raise UsageError(f"--sample: {path} is a {kind}, which is checked whole.", "a dataset.", "omit --sample.")
     if kind == "capture":
         return validate_capture(path, accept_units)
@@ -46,13 +46,17 @@ def validate(
         from .ladder import validate_ladder
 
         return validate_ladder(path, validate_model)
+    if kind == "run":
+        from .run import validate_run
+
+        return validate_run(path)
     if kind == "dataset":
         from .dataset import validate_dataset
 
         return validate_dataset(path, sample, seed)
-    found = "no such directory" if not path.exists() else "neither a capture, nor a model, nor a dataset, nor a ladder"
+    found = "no such directory" if not path.exists() else "no capture, model, dataset, ladder or run"
     raise InputDataError(
-        f"{path}: {found}.", "a directory with capture.toml, model.json, dataset.json or improve.json."
+        f"{path}: {found}.", "a directory with capture.toml, model.json, dataset.json, improve.json or control.json."
     )
 
 

@@ -1,0 +1,231 @@
+"""One run of a task: plant, sensing, controller and clock, step by step."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from ...schemas import JOINTS, ClockName, NotConvergedError
+from ..geometry.rotation import quat_exp, quat_multiply
+from .controller import Controller, ControlPlan, ControlState
+from .horizon import Array
+from .plant import Plant, Truth, start_of
+
+Ended = Literal["success", "timeout", "bad_states", "diverged"]
+
+
+@dataclass
+class Recording:
+    """What happened in a run: lists of rows, one for each command or each plan."""
+
+    seed: int
+    """Seed of the run."""
+    ended: Ended = "timeout"
+    """Why it ended."""
+    late: int = 0
+    """Plans that came after the command that they were for."""
+    held: int = 0
+    """States that were missing, stale or no numbers."""
+    commands: dict[str, list[Any]] = field(default_factory=dict)
+    """Columns with one row for each command: see :func:`_note_command`."""
+    plans: dict[str, list[Any]] = field(default_factory=dict)
+    """Columns with one row for each plan."""
+
+    def column(self, name: str, of: Literal["commands", "plans"] = "commands") -> Array:
+        """Return a column as an array."""
+        return np.asarray(getattr(self, of).get(name, ()), float)
+
+    def add(self, of: Literal["commands", "plans"], **row: Any) -> None:
+        """Append a row."""
+        table = getattr(self, of)
+        for name, value in row.items():
+            table.setdefault(name, []).append(value)
+
+
+class Sensor:
+    """Measured states of a plant: late by a constant delay, with noise.
+
+    Args:
+        controller: The controller, whose task has the delay and the noise.
+        seed: Seed of the noise.
+    """
+
+    def __init__(self, controller: Controller, seed: int) -> None:
+        plant = controller.task.plant
+        self._late = round(plant.delay_s / controller.interval_s)
+        self._interval_s = controller.interval_s
+        self._noise = plant.noise_m, math.radians(plant.noise_deg)
+        self._rng = np.random.default_rng([seed, 3])
+        self._states: deque[ControlState] = deque(maxlen=self._late + 1)
+
+    def seen(self, time_s: float, truth: Truth) -> ControlState:
+        """Return the newest state that has arrived at a time [s]; at the start the first one."""
+        place, turn = self._noise
+        quat = torch.as_tensor(truth.quat_wxyz)
+        shaken = quat_multiply(quat, quat_exp(torch.as_tensor(self._rng.normal(0.0, 1.0, 3) * turn)))
+        self._states.append(
+            ControlState(
+                time_s=time_s,
+                joints=dict(zip(JOINTS, map(float, truth.finger_m), strict=True)),
+                position_m=truth.position_m + self._rng.normal(0.0, 1.0, 3) * place,
+                quat_wxyz=shaken.numpy() if turn else truth.quat_wxyz,
+                velocity_m_s=truth.velocity_m_s,
+                omega_body_rad_s=truth.omega_body_rad_s,
+            )
+        )
+        return self._states[0]
+
+
+def run(controller: Controller, plant: Plant, seed: int, clock: ClockName) -> Recording:
+    """Run a task from a seed.
+
+    With the real clock a plan is made from the state at a command, and acts from the next command after the wall time
+    that it took; until then the commands of the plan before go on. The plant waits meanwhile. With the ideal clock a
+    plan acts at once.
+
+    Args:
+        controller: The controller.
+        plant: The plant.
+        seed: Seed of start, noise and plans.
+        clock: real or ideal.
+
+    Raises:
+        InputDataError: If something begins inside of something else.
+    """
+    task, interval = controller.task, controller.interval_s
+    controller.restart(seed)
+    truth = plant.reset(*start_of(controller.task_world, seed))
+    sensor, recording = Sensor(controller, seed), Recording(seed)
+    command = dict(zip(JOINTS, map(float, truth.finger_m), strict=True))
+    waiting, acting, within = _Waiting(interval, clock), None, 0.0
+    for number in range(math.ceil(task.success.timeout_s / interval - 1e-9)):
+        now = number * interval
+        acting = waiting.arrived(now) or acting
+        if waiting.free:
+            plan = controller.plan(sensor.seen(now, truth), now if clock == "ideal" else now + interval)
+            if plan is not None:
+                _note_plan(recording, controller, plan, waiting.begin(now, plan))
+                acting = waiting.arrived(now) or acting
+        else:
+            sensor.seen(now, truth)
+        if controller.lost:
+            recording.ended = "bad_states"
+            break
+        if acting is not None:
+            command = controller.limited(command, acting.targets.at(now + interval))
+        before = truth
+        try:
+            truth = plant.advance(np.array([command[name] for name in JOINTS]), interval)
+        except NotConvergedError:
+            recording.ended = "diverged"
+            break
+        errors = _errors(controller, truth)
+        _note_command(recording, controller, now, (before, truth), command, errors)
+        good = errors[0] <= task.success.position_m and errors[1] <= task.success.turn_deg
+        within = within + interval if good else 0.0
+        if good and within >= task.success.hold_s - 1e-9:
+            recording.ended = "success"
+            break
+    recording.late, recording.held = waiting.late, controller.held
+    return recording
+
+
+class _Waiting:
+    """The plan that is being made, and when it acts.
+
+    Args:
+        interval_s: Length of a command [s].
+        clock: real or ideal.
+    """
+
+    def __init__(self, interval_s: float, clock: ClockName) -> None:
+        self._interval_s, self._clock = interval_s, clock
+        self._plan: ControlPlan | None = None
+        self._ready_s = 0.0
+        self.late = 0
+        """Plans that took longer than a command."""
+
+    @property
+    def free(self) -> bool:
+        """Whether the next plan can be begun."""
+        return self._plan is None
+
+    def begin(self, now_s: float, plan: ControlPlan) -> bool:
+        """Take a plan that was begun now, and return whether it is late."""
+        self._plan = plan
+        if self._clock == "ideal":
+            self._ready_s = now_s
+            return False
+        self._ready_s = now_s + max(plan.wall_s, self._interval_s)
+        late = plan.wall_s > self._interval_s
+        self.late += late
+        return late
+
+    def arrived(self, now_s: float) -> ControlPlan | None:
+        """Return the plan that acts from now on; None where none is ready."""
+        if self._plan is None or now_s < self._ready_s - 1e-9:
+            return None
+        plan, self._plan = self._plan, None
+        return plan
+
+
+def _errors(controller: Controller, truth: Truth) -> tuple[float, float]:
+    """Return the error of the object's position [m] and of its turn [deg]."""
+    pose = torch.as_tensor(truth.position_m), torch.as_tensor(truth.quat_wxyz)
+    x, y, turn = controller.task_world.goal.errors(*pose).tolist()
+    return math.hypot(x, y), abs(math.degrees(turn))
+
+
+def _note_command(
+    recording: Recording,
+    controller: Controller,
+    now_s: float,
+    truths: tuple[Truth, Truth],
+    command: dict[str, float],
+    errors: tuple[float, float],
+) -> None:
+    """Record a command, the state before it and what came of it."""
+    before, after = truths
+    limits = controller.task.limits
+    last = recording.commands["target_m"][-1] if recording.commands else before.finger_m
+    target = np.array([command[name] for name in JOINTS])
+    recording.add(
+        "commands",
+        time_s=now_s,
+        position_m=before.position_m,
+        quat_wxyz=before.quat_wxyz,
+        velocity_m_s=before.velocity_m_s,
+        omega_body_rad_s=before.omega_body_rad_s,
+        finger_m=before.finger_m,
+        target_m=target,
+        action=np.clip((target - last) / (limits.speed_m_s * controller.interval_s), -1.0, 1.0),
+        next_position_m=after.position_m,
+        next_quat_wxyz=after.quat_wxyz,
+        next_finger_m=after.finger_m,
+        force_n=after.force_n,
+        position_error_m=errors[0],
+        turn_error_deg=errors[1],
+    )
+
+
+def _note_plan(recording: Recording, controller: Controller, plan: ControlPlan, late: bool) -> None:
+    """Record a plan and what the model predicts of it, at the ends of its last `knots` pieces."""
+    found, knots = controller.forecast(), controller.task.planner.knots
+    recording.add(
+        "plans",
+        state_s=plan.state_s,
+        acts_s=plan.acts_s,
+        wall_s=plan.wall_s,
+        cpu_s=plan.cpu_s,
+        late=late,
+        cost=plan.cost,
+        times_s=plan.targets.times_s[-knots:],
+        targets_m=plan.targets.values_m[-knots:],
+        position_m=found.position_m[-knots:],
+        quat_wxyz=found.quat_wxyz[-knots:],
+    )

@@ -1,0 +1,282 @@
+"""The stage control (`cgwm control`): a task run through a model, from several seeds, with recording and page."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...datasets.io.atomic import new_directory, sha256
+from ...datasets.io.neighbours import clean_stale
+from ...datasets.io.outputs import reads, refuse_output
+from ...datasets.io.progress import note
+from ...datasets.models.fit_inputs import versions
+from ...datasets.models.model import Model, read_model
+from ...datasets.rollouts.control_file import RunTables, write_runs
+from ...schemas import (
+    ClockName,
+    ControlResult,
+    ControlRun,
+    ControlTask,
+    InputDataError,
+    InterruptedWork,
+    SolverName,
+    UsageError,
+    read_json,
+    read_task,
+    task_toml,
+)
+from ..runtime.checkpoint import Checkpoint
+from ..runtime.device import resolve_device
+from .controller import Controller, ControlState
+from .film import film_of
+from .loop import run
+from .mujoco_plant import MujocoPlant
+from .page import PAGE, PageRun, control_html
+from .plant import ModelPlant, Plant, start_of
+from .tables import figures_of, tables_of
+from .wording import advice, sentence, wilson
+
+DOCUMENT, RECORDING, FILM = "control.json", "run.h5", "run.webm"
+TRIALS = 7
+"""Plans that are timed before a run with the real clock; the first ones compile and are not counted."""
+SLOWEST = 2.0
+"""Largest duration of a plan in units of a command's: beyond it, half of the states are never looked at."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Request:
+    """Arguments of a control."""
+
+    model: Model
+    """The model."""
+    task: ControlTask
+    """The task."""
+    solver: SolverName
+    """Solver of the plans."""
+    clock: ClockName
+    """The clock."""
+    seeds: int
+    """Number of runs, with the seeds 0 to `seeds` - 1."""
+    draws: int
+    """Draws of the model for each plan."""
+    device: str
+    """Device of the predictions."""
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """What was asked for, by name."""
+        names = ("solver", "clock", "seeds", "draws", "device")
+        return {name: str(getattr(self, name)) for name in names} | {"task": self.task.model_dump_json()}
+
+    def inputs(self) -> dict[str, str]:
+        """Return the SHA-256 of the files that are read, by name."""
+        files = {} if self.model.root is None else {"model": self.model.root / "model.json"}
+        files |= {name: self.task.folder / name for name in self.task.plant.meshes}
+        return {name: sha256(path) for name, path in files.items() if path.is_file()}
+
+
+@reads("model", "task")
+def control(
+    model: Path,
+    task: Path,
+    out: Path,
+    solver: SolverName = "mppi",
+    clock: ClockName = "real",
+    seeds: int = 1,
+    draws: int = 0,
+    device: str = "auto",
+    overwrite: bool = False,
+    resume: bool = False,
+) -> ControlResult:
+    """Run a task of control through a fitted model, from several seeds.
+
+    Args:
+        model: The model.
+        task: The task's file.
+        out: The directory to write: `control.json`, `run.h5`, a page and a film; it appears when complete.
+        solver: mppi, gauss-newton or both.
+        clock: real: a plan acts after the wall time that it took; ideal: at once.
+        seeds: Number of runs, with the seeds 0 to `seeds` - 1.
+        draws: Draws of the model's uncertainty that each plan is evaluated under; 0 for the estimate alone.
+        device: Device of the predictions: auto, cpu or cuda.
+        overwrite: Replace an existing run.
+        resume: Continue an interrupted run; a complete one of the same inputs and settings is kept.
+
+    Returns:
+        The content of `control.json`.
+
+    Raises:
+        UsageError: If `out` exists, or a number is out of range.
+        InputDataError: If the model cannot serve the task, or its plans take longer than the task allows.
+    """
+    out = Path(out)
+    if seeds < 1:
+        raise UsageError(f"--seeds {seeds}.", "1 or more.")
+    if draws < 0:
+        raise UsageError(f"--draws {draws}.", "0 or more.")
+    clean_stale(out)
+    finished = (out / DOCUMENT).is_file()
+    if not (finished and resume):
+        refuse_output(out, "run", overwrite)
+    request = _Request(
+        model=read_model(model),
+        task=read_task(Path(task)),
+        solver=solver,
+        clock=clock,
+        seeds=seeds,
+        draws=draws,
+        device=resolve_device(device).type,
+    )
+    made_of = {**request.inputs(), **request.settings, "versions": json.dumps(versions())}
+    if finished and resume and (kept := _kept(out, request)) is not None:
+        note(f"control: {out} is already the result of this command")
+        return kept
+    refuse_output(out, "run", overwrite)
+    controller = Controller(request.model, request.task, solver, draws=draws, device=request.device)
+    plant = _plant(controller)
+    for seed in range(seeds):
+        plant.reset(*start_of(controller.task_world, seed))  # refuses what begins inside of something else
+    if clock == "real":
+        _require_speed(controller, plant)
+    checkpoint = Checkpoint.beside(out, made_of, resume, overwrite, "a run")
+    try:
+        runs = [_run(controller, plant, seed, clock, checkpoint) for seed in range(seeds)]
+        result = _write(out, request, controller, runs, (str(model), str(task)), overwrite)
+    except KeyboardInterrupt:
+        raise InterruptedWork(f"{checkpoint.path} holds the runs that ended; --resume goes on with them.") from None
+    checkpoint.remove()
+    return result
+
+
+def _kept(out: Path, request: _Request) -> ControlResult | None:
+    """Return the result of a complete run if it is made of the same; None if it is not."""
+    found = read_json(out / DOCUMENT, ControlResult)
+    same = found.settings == request.settings and found.input_sha256 == request.inputs()
+    return found if same and found.versions == versions() else None
+
+
+def _plant(controller: Controller) -> Plant:
+    found = controller.task_world
+    return MujocoPlant(found) if found.task.plant.kind == "mujoco" else ModelPlant(found)
+
+
+def _require_speed(controller: Controller, plant: Plant) -> None:
+    """Check that a plan does not take much longer than a command.
+
+    Raises:
+        InputDataError: If it does, with the rate that is reached.
+    """
+    truth = plant.reset(*start_of(controller.task_world, 0))
+    durations = []
+    for number in range(TRIALS):
+        state = ControlState(
+            time_s=number * controller.interval_s,
+            joints=dict(zip(("x", "y"), map(float, truth.finger_m), strict=True)),
+            position_m=truth.position_m,
+            quat_wxyz=truth.quat_wxyz,
+        )
+        plan = controller.plan(state, state.time_s + controller.interval_s)
+        durations.append(math.inf if plan is None else plan.wall_s)
+    taken, task = float(np.median(durations[TRIALS // 2 :])), controller.task
+    if taken > SLOWEST * controller.interval_s:
+        reason = f" Predictions run in the slow engine: {controller.slow}." if controller.slow else ""
+        raise InputDataError(
+            f"{task.source}: [planner] control_hz = {task.planner.control_hz:g}: a plan takes {1e3 * taken:.0f} ms "
+            f"here, so {1 / taken:.3g} a second.{reason}",
+            f"up to {SLOWEST / taken:.3g}, of which half is reached.",
+            advice(task, taken) or "lower control_hz, or pass --clock ideal.",
+        )
+
+
+def _run(controller: Controller, plant: Plant, seed: int, clock: ClockName, checkpoint: Checkpoint) -> PageRun:
+    """Return a run from its checkpoint; it is made first if there is none."""
+    slot = checkpoint.slot(f"seed {seed}")
+    kept = slot.read(torch.device("cpu"))
+    if kept is None:
+        note(f"control: seed {seed}")
+        recording = run(controller, plant, seed, clock)
+        tables = tables_of(recording, controller.task, clock == "real")
+        figures = figures_of(recording, tables, _start_errors(controller, seed), controller.interval_s)
+        arrays = {name: torch.as_tensor(values) for name, values in tables.arrays.items()}
+        kept = {"figures": figures.model_dump_json(), "ended": recording.ended, "arrays": arrays}
+        slot.write(kept)
+    figures = ControlRun.model_validate_json(kept["figures"])
+    arrays = {name: values.numpy() for name, values in kept["arrays"].items()}
+    return PageRun(figures=figures, tables=RunTables(seed=seed, ended=kept["ended"], arrays=arrays))
+
+
+def _start_errors(controller: Controller, seed: int) -> tuple[float, float]:
+    place, turn, _ = start_of(controller.task_world, seed)
+    position, quat = controller.task_world.pose(place, turn)
+    x, y, angle = controller.task_world.goal.errors(torch.as_tensor(position), torch.as_tensor(quat)).tolist()
+    return math.hypot(x, y), abs(math.degrees(angle))
+
+
+def _write(
+    out: Path,
+    request: _Request,
+    controller: Controller,
+    runs: list[PageRun],
+    names: tuple[str, str],
+    overwrite: bool,
+) -> ControlResult:
+    """Write recording, film, page and document, and return the document."""
+    with new_directory(out, "run", overwrite) as folder:
+        creator = f"cgwm {versions()['cgwm']}"
+        write_runs(folder / RECORDING, [one.tables for one in runs], task_toml(request.task), creator)
+        film, sheet = film_of(controller.task_world, runs[0].tables, request.device)
+        if film is not None:
+            (folder / FILM).write_bytes(film)
+        result = _result(request, controller, runs, names, folder / RECORDING, None if film is None else FILM)
+        page = control_html(result, request.task, runs, sheet)
+        (folder / PAGE).write_text(page, encoding="utf-8")
+        (folder / DOCUMENT).write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    return result
+
+
+def _result(
+    request: _Request,
+    controller: Controller,
+    runs: Iterable[PageRun],
+    names: tuple[str, str],
+    recording: Path,
+    film: str | None,
+) -> ControlResult:
+    figures = tuple(one.figures for one in runs)
+    good = [one for one in figures if one.ended == "success"]
+    taken = float(np.median([one.plan_ms for one in figures])) / 1e3
+    late = sum(one.late_plans for one in figures)
+    warnings = [f"predictions run in the slow engine: {controller.slow}."] if controller.slow else []
+    return ControlResult(
+        model=names[0],
+        task=names[1],
+        object=controller.task_world.world.body_names[controller.task_world.object],
+        solver=request.solver,
+        clock=request.clock,
+        plant=request.task.plant.kind,
+        draws=request.draws,
+        device=request.device,
+        control_hz=request.task.planner.control_hz,
+        reached_hz=1 / taken if taken > 0 else 0.0,
+        sentence=sentence(figures, request.task, request.clock),
+        advice=advice(request.task, taken) if late else "",
+        successes=len(good),
+        success_rate=len(good) / len(figures),
+        success_interval_95=wilson(len(good), len(figures)),
+        median_time_s=float(np.median([one.time_s for one in good])) if good else None,
+        runs=figures,
+        recording=RECORDING,
+        page=PAGE,
+        video=film,
+        recording_sha256=sha256(recording),
+        input_sha256=request.inputs(),
+        settings=request.settings,
+        versions=versions(),
+        warnings=tuple(warnings),
+    )
