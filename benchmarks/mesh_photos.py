@@ -147,20 +147,45 @@ def write_capture(root: Path, painted: Painted, views: int, size: int, depth_noi
 
 def draw(painted: Painted, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
     """Return a photo (H, W, 3), its mask (H, W): 1 where most of a pixel shows the mesh, and the depth [m] (H, W)."""
-    width, height = SAMPLES * camera.width, SAMPLES * camera.height
+    image, _, cover, depths = draw_parts(painted, camera)
+    return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8), (cover > 0.5).astype(np.uint8), depths
+
+
+def draw_parts(
+    painted: Painted, camera: Camera, backdrop: tuple[float, float, float] = BACKDROP, samples: int = SAMPLES
+) -> tuple[NDArray[np.float32], Array, Array, Array]:
+    """Return what a camera sees of a mesh, without light.
+
+    Args:
+        painted: The mesh and its colours.
+        camera: A camera without lens distortion.
+        backdrop: Colour of pixels that show no mesh, in [0, 1].
+        samples: Samples a pixel along each axis.
+
+    Returns:
+        The colours (H, W, 3), averaged over the samples of a pixel; at the middle of each pixel the outward normal of
+        the face (H, W, 3) and the depth [m] (H, W), 0 where no mesh is seen; between them the share of each pixel that
+        shows the mesh (H, W): colours, normals, cover, depth.
+    """
+    width, height = samples * camera.width, samples * camera.height
     pixel, depth = camera.resized(width, height).project(painted.mesh.vertices)
     face, weight, place = _visible(pixel, depth, painted.mesh.faces, width, height)
-    fine = np.tile(np.array(BACKDROP, np.float32), (height * width, 1))
+    fine = np.tile(np.array(backdrop, np.float32), (height * width, 1))
     fine[place] = painted.color(face, weight)
-    covered = np.zeros(height * width, np.float32)
+    covered, depths, normals = np.zeros(height * width), np.zeros(height * width), np.zeros((height * width, 3))
     covered[place] = 1
-    depths = np.zeros(height * width)
     depths[place] = (weight * depth[painted.mesh.faces[face]]).sum(1)
-    shape = (camera.height, SAMPLES, camera.width, SAMPLES)
-    image = fine.reshape(*shape, 3).mean((1, 3))
-    cover = covered.reshape(shape).mean((1, 3))
-    middle = depths.reshape(height, width)[SAMPLES // 2 :: SAMPLES, SAMPLES // 2 :: SAMPLES]
-    return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8), (cover > 0.5).astype(np.uint8), middle
+    corners = painted.mesh.corners()
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals[place] = (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30))[face]
+    shape = (camera.height, samples, camera.width, samples)
+    middle = slice(samples // 2, None, samples)
+    return (
+        fine.reshape(*shape, 3).mean((1, 3)),
+        normals.reshape(height, width, 3)[middle, middle],
+        covered.reshape(shape).mean((1, 3)),
+        depths.reshape(height, width)[middle, middle],
+    )
 
 
 def _visible(

@@ -57,6 +57,8 @@ class CalibrationAttempt(FileModel):
     peak_threshold: float
     guided_matching: bool
     max_ratio: float
+    camera_model: str = ""
+    """COLMAP's camera model: the simplest that no richer one beats; empty where nothing was estimated."""
     models: int
     """Connected models; the largest is taken."""
     registered: int
@@ -105,6 +107,7 @@ class CalibrationReport(FileModel):
             f"{self.photos_registered} of {self.photos} photos registered, "
             f"{self.points} points, reprojection {self.reprojection_error_px:.2f} px, {self.wall_time_s:.0f} s",
             f"self-check: {_passed(self.self_check)}",
+            *(f"camera model: {one.camera_model}" for one in self.attempts if one.outcome == "taken"),
         ]
         if self.videos:
             seen = sum(verdict.registered for verdict in self.videos.values())

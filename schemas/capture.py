@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 
 from .articulations import Articulation
 from .base import FileModel
+from .cameras import CameraIntrinsics
 from .materials import pair_of, repeated
 from .pose import Pose
 from .quantities import (
@@ -276,6 +277,19 @@ class Calibration(FileModel):
     """Whether a supplied transforms.json or COLMAP model is in metres; cameras.json says it itself."""
     same_camera: bool = True
     """Whether all photos (not the video frames) were taken with one camera at one focal length."""
+    intrinsics: tuple[CameraIntrinsics, ...] = ()
+    """Known intrinsics of the photos of a size, as in cameras.json; they are used as they are. Those of other sizes are
+    estimated."""
+
+    @model_validator(mode="after")
+    def _known_cameras(self) -> Calibration:
+        sizes = [(one.width, one.height) for one in self.intrinsics]
+        twice = next((size for size in sizes if sizes.count(size) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two [[calibration.intrinsics]] are of photos of {twice[0]}x{twice[1]}; give one a size")
+        if any(len(one.distortion) > 4 for one in self.intrinsics):
+            raise ValueError("[[calibration.intrinsics]] take the distortion k1, k2, p1, p2; k3 is not used")
+        return self
 
     @model_validator(mode="after")
     def _one_scale(self) -> Calibration:

@@ -11,7 +11,9 @@ import numpy as np
 from ...schemas import CalibrateConfig, NotConvergedError
 from ...schemas.calibration import CalibrationAttempt, ImageVerdict, PairFigures, SelfCheckFigures
 from . import colmap
+from .camera_models import FIRST_TRIED, LADDER, richer, supported
 from .consistency_check import SelfCheck, check_model
+from .mapping import Mapped, map_database, refined
 from .photos import Inputs
 from .reconstruction import SfmModel, VerifiedPair
 
@@ -30,6 +32,8 @@ class Candidate:
 
     model: SfmModel
     """The largest connected model."""
+    camera_model: str
+    """Camera model that its observations support."""
     check: SelfCheck
     """Self-check of that model."""
     models: tuple[SfmModel, ...]
@@ -115,22 +119,59 @@ def _attempt(
                 path.rename(folder / path.name.replace(f"-{number - 1}.", f"-{number}."))
     else:
         colmap.build_database(database, inputs.root, [source.image for source in inputs.sources], settings)
-    models = tuple(model.renamed(names) for model in colmap.map_database(database, inputs.root, settings.seed))
+    models, camera_model = _models(database, inputs, settings.seed)
     pairs = tuple(
         replace(pair, image_a=names[pair.image_a], image_b=names[pair.image_b]) for pair in colmap.read_pairs(database)
     )
     candidate = None
     if models:
         features = {names[name]: count for name, count in colmap.feature_counts(database).items()}
+        named = tuple(model.renamed(names) for model in models)
         candidate = Candidate(
-            model=models[0],
-            check=check_model(models[0], pairs),
-            models=models,
+            model=named[0],
+            camera_model=camera_model,
+            check=check_model(named[0], pairs),
+            models=named,
             pairs=pairs,
             features=features,
             attempt=number,
         )
     return candidate, _attempt_figures(settings, candidate)
+
+
+def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[SfmModel], str]:
+    """Return the connected models of the camera model that registers most images, the largest refined; and which it is.
+
+    The mapping tries camera models from simple ones on until all images are registered. Of the largest model, cameras
+    are then as rich as its observations support.
+    """
+    best: list[Mapped] = []
+    start = ""
+    for model in FIRST_TRIED:
+        models = _limited(model, inputs)
+        mapped = map_database(database, inputs.root, seed, models, inputs.known)
+        if mapped and (not best or mapped[0].image_count > best[0].image_count):
+            best, start = mapped, model
+        if _all_known(inputs) or (best and best[0].image_count == len(inputs.sources)):
+            break
+    if not best:
+        return [], ""
+    steps = [
+        (model, refined(best[0], _limited(model, inputs), inputs.known, seed))
+        for model in richer(start, "SIMPLE_PINHOLE" if _all_known(inputs) else "OPENCV")
+    ]
+    free = len(set(best[0].names.values()) - set(inputs.known))
+    taken = supported([(model, step.residuals_px()) for model, step in steps], free)
+    return [dict(steps)[taken].model(), *(one.model() for one in best[1:])], taken
+
+
+def _limited(model: str, inputs: Inputs) -> dict[str, str]:
+    """Return a camera model by camera, no richer than the camera's photos allow."""
+    return {camera: min(model, richest, key=LADDER.index) for camera, richest in inputs.richest.items()}
+
+
+def _all_known(inputs: Inputs) -> bool:
+    return all(source.image.camera in inputs.known for source in inputs.sources)
 
 
 def _attempt_figures(settings: colmap.SfmSettings, candidate: Candidate | None) -> CalibrationAttempt:
@@ -143,6 +184,7 @@ def _attempt_figures(settings: colmap.SfmSettings, candidate: Candidate | None) 
         guided_matching=settings.guided_matching,
         max_ratio=settings.max_ratio,
         models=len(candidate.models) if candidate else 0,
+        camera_model=candidate.camera_model if candidate else "",
         registered=len(candidate.model.T_cam_world) if candidate else 0,
         points=len(candidate.model.points) if candidate else 0,
         reprojection_error_px=candidate.model.reprojection_error_px if candidate else None,
@@ -212,10 +254,12 @@ def _not_converged(
             causes[reason] = causes.get(reason, 0) + 1
     listed = ", ".join(f"{count} {reason}" for reason, count in sorted(causes.items(), key=lambda item: -item[1]))
     return NotConvergedError(
-        f"{registered} of {photos} photos registered after {len(attempts)} attempts. The others: {listed}.",
+        f"{registered} of {photos} photos registered after {len(attempts)} attempts with the camera models "
+        f"{', '.join(FIRST_TRIED)}. The others: {listed}.",
         f"at least {_needed(inputs)} of {photos}.",
         "take sharp photos in steps of 10 degrees or less, all around and from two heights, with the same focal "
-        "length; keep textured surroundings in view; nothing may move between the photos.",
+        "length; keep textured surroundings in view; nothing may move between the photos. Known intrinsics "
+        "([[calibration.intrinsics]]) help where the object fills little of the photos.",
     )
 
 

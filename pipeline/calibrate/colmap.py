@@ -1,7 +1,8 @@
-"""Adapter of pycolmap: features, matches and mapping, repeatable bit for bit.
+"""Adapter of pycolmap: features and matches of photos, repeatable bit for bit.
 
 Every seed is set and extraction, matching and mapping run on one thread each: with automatic thread counts two runs
-on the same photos differ. pycolmap is released often with renamed functions, so no other module imports it.
+on the same photos differ. pycolmap is released often with renamed functions, so only this module and `mapping` import
+it.
 """
 
 from __future__ import annotations
@@ -18,13 +19,12 @@ import numpy as np
 import pycolmap
 
 from ...datasets.io.progress import progress
-from .reconstruction import SfmCamera, SfmModel, VerifiedPair
+from .reconstruction import VerifiedPair
 
 ResultT = TypeVar("ResultT")
 
 _EXTRACTION_CHUNK = 4
 _MATCHING_BLOCK = 25
-_MIN_MODEL_IMAGES = 3
 _POLL_S = 0.2
 
 pycolmap.logging.minloglevel = 3  # COLMAP's log would drown ours; its results are read from the database
@@ -48,8 +48,6 @@ class SfmImage:
     """Path relative to the image root, with forward slashes."""
     camera: str
     """Name of the camera; images of one camera share their intrinsics and their size."""
-    model: str = "OPENCV"
-    """COLMAP's camera model: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV."""
     mask: Path | None = None
     """Folder of masks, `<name>.png`, 0 where features are excluded; None uses the whole images."""
 
@@ -104,33 +102,6 @@ def build_database(database: Path, root: Path, images: Sequence[SfmImage], setti
     _match(database, [image.name for image in images], settings)
 
 
-def map_database(database: Path, root: Path, seed: int) -> list[SfmModel]:
-    """Estimate cameras and points; return all connected models, the one with most images first."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = 1
-    options.random_seed = seed
-    options.mapper.num_threads = 1
-    options.mapper.random_seed = seed
-    options.triangulation.random_seed = seed
-    options.min_model_size = _MIN_MODEL_IMAGES
-    output = database.with_suffix(".models")
-    output.mkdir(exist_ok=True)
-    count = _count(database, lambda opened: opened.num_images())
-    with progress(range(count), "mapping", total=count, unit="image") as bar:
-        found = _run(
-            pycolmap.incremental_mapping,
-            seed,
-            database_path=database,
-            image_path=root,
-            output_path=output,
-            options=options,
-            next_image_callback=lambda: bar.update(1),
-        )
-    cameras = _camera_names(database)
-    models = [_plain_model(found[key], cameras) for key in sorted(found)]
-    return sorted(models, key=lambda model: -len(model.T_cam_world))
-
-
 def read_pairs(database: Path) -> list[VerifiedPair]:
     """Return the verified pairs of a database, in the order of their identifiers."""
     opened = pycolmap.Database.open(database)
@@ -151,7 +122,7 @@ def read_pairs(database: Path) -> list[VerifiedPair]:
 
 def feature_counts(database: Path) -> dict[str, int]:
     """Return the number of features of each image that COLMAP could read."""
-    return _count(
+    return count(
         database,
         lambda opened: {
             image.name: int(opened.num_keypoints_for_image(image.image_id)) for image in opened.read_all_images()
@@ -171,11 +142,11 @@ def _extract(database: Path, root: Path, images: Sequence[SfmImage], settings: S
         for group in _groups(images):
             for chunk in _chunks(group, _EXTRACTION_CHUNK):
                 reader = pycolmap.ImageReaderOptions()
-                reader.camera_model = chunk[0].model
+                reader.camera_model = "SIMPLE_PINHOLE"  # features and matches do not depend on it
                 reader.existing_camera_id = _existing_camera(database, group[0].name)
                 if chunk[0].mask is not None:
                     reader.mask_path = chunk[0].mask
-                _run(
+                run(
                     pycolmap.extract_features,
                     settings.seed,
                     database_path=database,
@@ -208,7 +179,7 @@ def _match(database: Path, names: Sequence[str], settings: SfmSettings) -> None:
     with progress(range(total), "matches", total=total, unit="pair") as bar:
         for chunk in blocks:
             Path(pairing.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in chunk), encoding="utf-8")
-            _run(
+            run(
                 pycolmap.match_image_pairs,
                 settings.seed,
                 database_path=database,
@@ -228,8 +199,8 @@ def _pair_blocks(names: Sequence[str]) -> list[list[tuple[str, str]]]:
     return [block for block in blocks if block]
 
 
-def _run(function: Callable[..., ResultT], seed: int, **arguments: Any) -> ResultT:
-    """Call pycolmap in a separate thread, so that Ctrl-C cancels it instead of waiting for its end.
+def run(function: Callable[..., ResultT], seed: int, **arguments: Any) -> ResultT:
+    """Call a function of pycolmap in a separate thread, so that Ctrl-C cancels it instead of waiting for its end.
 
     COLMAP's generator belongs to the thread, so it is seeded there.
     """
@@ -268,7 +239,8 @@ def _chunks(items: Sequence[Any], size: int) -> Iterable[Sequence[Any]]:
     return (items[start : start + size] for start in range(0, len(items), size))
 
 
-def _count(database: Path, read: Callable[[Any], ResultT]) -> ResultT:
+def count(database: Path, read: Callable[[Any], ResultT]) -> ResultT:
+    """Return what a function reads from an opened database."""
     opened = pycolmap.Database.open(database)
     try:
         return read(opened)
@@ -282,54 +254,19 @@ def _existing_camera(database: Path, image: str) -> int:
     def read(opened: Any) -> int:
         return opened.read_image_with_name(image).camera_id if opened.exists_image(image) else -1
 
-    return _count(database, read)
+    return count(database, read)
 
 
 def _name_cameras(database: Path, images: Sequence[SfmImage]) -> None:
     names = {image.name: image.camera for image in images}
     identifiers = {
-        image.camera_id: names[image.name] for image in _count(database, lambda opened: opened.read_all_images())
+        image.camera_id: names[image.name] for image in count(database, lambda opened: opened.read_all_images())
     }
     lines = [f"{identifier} {name}\n" for identifier, name in sorted(identifiers.items())]
     database.with_suffix(".cameras.txt").write_text("".join(lines), encoding="utf-8")
 
 
-def _camera_names(database: Path) -> dict[int, str]:
+def camera_names(database: Path) -> dict[int, str]:
+    """Return the name of each camera of a database by its identifier."""
     lines = database.with_suffix(".cameras.txt").read_text(encoding="utf-8").splitlines()
     return {int(line.split(" ", 1)[0]): line.split(" ", 1)[1] for line in lines}
-
-
-def _plain_model(model: pycolmap.Reconstruction, camera_names: dict[int, str]) -> SfmModel:
-    model.update_point_3d_errors()
-    point_ids = sorted(model.points3D)
-    index = {point_id: i for i, point_id in enumerate(point_ids)}
-    points = [model.points3D[point_id] for point_id in point_ids]
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
-    poses, observations = {}, {}
-    for image in images:
-        poses[image.name] = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
-        seen = [point for point in image.points2D if point.has_point3D()]
-        observations[image.name] = (
-            np.array([point.xy for point in seen], dtype=float).reshape(-1, 2),
-            np.array([index[point.point3D_id] for point in seen], dtype=np.int64),
-        )
-    used = {image.camera_id for image in images}
-    return SfmModel(
-        cameras={camera_names[key]: _plain_camera(model.cameras[key]) for key in sorted(used)},
-        image_camera={image.name: camera_names[image.camera_id] for image in images},
-        T_cam_world=poses,
-        points=np.array([point.xyz for point in points], dtype=float).reshape(-1, 3),
-        colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
-        observations=observations,
-        reprojection_error_px=float(model.compute_mean_reprojection_error()),
-    )
-
-
-def _plain_camera(camera: pycolmap.Camera) -> SfmCamera:
-    focal = [float(value) for value in camera.params[camera.focal_length_idxs()]]
-    cx, cy = (float(value) for value in camera.params[camera.principal_point_idxs()])
-    extra = [float(value) for value in camera.params[camera.extra_params_idxs()]]
-    k1, k2, p1, p2 = [*extra, 0.0, 0.0, 0.0, 0.0][:4]
-    return SfmCamera(
-        width=camera.width, height=camera.height, fx=focal[0], fy=focal[-1], cx=cx, cy=cy, distortion=(k1, k2, p1, p2)
-    )

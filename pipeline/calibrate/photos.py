@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.images import image_size, write_image
+from ...schemas import CameraIntrinsics, InputDataError
 from .colmap import SfmImage
 
 STILL_BELOW_PX = 2.0
 """Threshold on the median displacement of the background per 1000 px of image width [px], for a static camera."""
 _EPISODES_LOOKED_AT = 4
 _FEW_PHOTOS = 6
-"""Minimum number of photos of a camera for four lens parameters; with fewer only k1 is estimated."""
+"""Minimum number of photos of a camera for four lens parameters; with fewer at most k1 is estimated."""
 _MASK_MARGIN_PX = 5
 
 
@@ -46,6 +47,10 @@ class Inputs:
     """Messages for the user: moving video cameras, photos of several sizes."""
     moving: dict[str, str]
     """Omitted video cameras, with the reason."""
+    richest: dict[str, str]
+    """Richest camera model that is estimated for each camera, from its number of photos."""
+    known: dict[str, CameraIntrinsics]
+    """Intrinsics of cameras that are given and not estimated."""
 
 
 def video_label(camera: str) -> str:
@@ -61,7 +66,7 @@ def gather(capture: Capture, folder: Path) -> Inputs:
         folder: An empty folder, kept for the duration of the calibration.
     """
     root = folder / "images"
-    sources, notes = _photos(capture, root)
+    sources, notes, richest = _photos(capture, root)
     moving: dict[str, str] = {}
     for camera in capture.video_cameras():
         frames, masks = _probe_frames(capture, camera)
@@ -74,7 +79,9 @@ def gather(capture: Capture, folder: Path) -> Inputs:
             notes.append(f"video camera '{camera}' is left out: {moving[camera]}; give its poses in cameras.json")
             continue
         sources.append(_video_source(folder, root, camera, frames[0], masks[0]))
-    return Inputs(root, tuple(sources), tuple(notes), moving)
+        richest[f"video-{camera}"] = "SIMPLE_PINHOLE"  # one frame does not determine a lens
+    known = _known(capture, sources)
+    return Inputs(root, tuple(sources), tuple(notes), moving, richest, known)
 
 
 def background_flow(frames: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray[np.uint8] | None]) -> float:
@@ -102,13 +109,36 @@ def background_flow(frames: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray
     return worst
 
 
-def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str]]:
+def _known(capture: Capture, sources: Sequence[Source]) -> dict[str, CameraIntrinsics]:
+    """Return the given intrinsics by camera; refuse those of a size that no photo has."""
+    given = {(one.width, one.height): one for one in capture.manifest.calibration.intrinsics}
+    known, sizes = {}, set()
+    for source in sources:
+        if source.label.startswith(video_label("")):
+            continue
+        size = image_size(capture.root / "images" / source.label)
+        sizes.add(size)
+        if size in given:
+            known[source.image.camera] = given[size]
+    for width, height in given:
+        if (width, height) not in sizes:
+            listed = ", ".join(f"{one[0]}x{one[1]}" for one in sorted(sizes))
+            raise InputDataError(
+                f"{capture.root / 'capture.toml'}: [[calibration.intrinsics]] are of photos of {width}x{height}, and "
+                "no photo has that size.",
+                f"the size of photos that are there: {listed}.",
+                "give the intrinsics at the size of the photos (fx, fy, cx and cy grow with the size).",
+            )
+    return known
+
+
+def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str], dict[str, str]]:
     (root / "photos").mkdir(parents=True)
     names = capture.photos()
     sizes = {name: image_size(capture.root / "images" / name) for name in names}
     distinct = sorted(set(sizes.values()))
     same = capture.manifest.calibration.same_camera
-    sources = []
+    sources, richest = [], {}
     for index, name in enumerate(names):
         # Numbers replace the names, because COLMAP separates lists by blanks.
         inside = f"photos/{index:06d}{Path(name).suffix.lower()}"
@@ -116,13 +146,13 @@ def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str]]:
         width, height = sizes[name]
         camera = name if not same else "photos" if len(distinct) == 1 else f"photos-{width}x{height}"
         alike = sum(size == sizes[name] for size in sizes.values()) if same else 1
-        model = "OPENCV" if alike >= _FEW_PHOTOS else "SIMPLE_RADIAL"
-        sources.append(Source(name, SfmImage(inside, camera, model)))
+        richest[camera] = "OPENCV" if alike >= _FEW_PHOTOS else "SIMPLE_RADIAL"
+        sources.append(Source(name, SfmImage(inside, camera)))
     notes = []
     if same and len(distinct) > 1:
         listed = ", ".join(f"{width}x{height}" for width, height in distinct)
         notes.append(f"photos of {len(distinct)} sizes ({listed}): each size has separate intrinsics")
-    return sources, notes
+    return sources, notes, richest
 
 
 def _video_source(
@@ -139,8 +169,7 @@ def _video_source(
         kernel = np.ones((2 * _MASK_MARGIN_PX + 1, 2 * _MASK_MARGIN_PX + 1), np.uint8)
         keep = np.where(cv2.dilate((mask > 0).astype(np.uint8), kernel) > 0, 0, 255).astype(np.uint8)
         write_image(masks / f"{inside}.png", keep)
-    # One frame does not determine a lens: only the focal length is estimated.
-    return Source(video_label(camera), SfmImage(inside, f"video-{camera}", "SIMPLE_PINHOLE", masks))
+    return Source(video_label(camera), SfmImage(inside, f"video-{camera}", masks))
 
 
 def _probe_frames(capture: Capture, camera: str) -> tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8] | None]]:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cgwm.datasets.capture.cameras import read_cameras, require_metric
 from cgwm.datasets.capture.sparse_points import read_points
-from cgwm.pipeline.calibrate import attempts, calibrate, colmap
+from cgwm.pipeline.calibrate import attempts, calibrate, colmap, mapping
 from cgwm.pipeline.calibrate.consistency_check import PairCheck, SelfCheck
 from cgwm.pipeline.calibrate.markers import dictionary
 from cgwm.pipeline.calibrate.photos import background_flow
@@ -282,13 +282,42 @@ def test_a_rejected_model_is_followed_by_another_seed_on_the_same_matches(scene,
     assert len(built) == 1
 
 
+KNOWN = """[[calibration.intrinsics]]
+model = "PINHOLE"
+width = 400
+height = 300
+fx = 420.0
+fy = 420.0
+cx = 200.0
+cy = 150.0
+"""
+
+
+def test_known_intrinsics_are_used_as_they_are(scene, tmp_path):
+    root = _fresh(scene, tmp_path, MANIFEST + MARKERS + KNOWN, photos=5)
+    calibrate(root, CalibrateConfig(max_features=500))
+    camera = read_json(root / "cameras.json", CamerasFile).cameras["photos"]
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (420.0, 420.0, 200.0, 150.0, ())
+
+
+def test_known_intrinsics_of_another_size_are_refused(scene, tmp_path):
+    root = _fresh(scene, tmp_path, MANIFEST + KNOWN.replace("width = 400", "width = 800"), photos=3)
+    with pytest.raises(InputDataError) as caught:
+        calibrate(root, CONFIG)
+    assert str(caught.value) == (
+        f"{root / 'capture.toml'}: [[calibration.intrinsics]] are of photos of 800x300, and no photo has that size.\n"
+        "Allowed: the size of photos that are there: 400x300.\n"
+        "Next: give the intrinsics at the size of the photos (fx, fy, cx and cy grow with the size)."
+    )
+
+
 def test_self_check_on_a_real_model_and_the_same_model_broken(scene, tmp_path):
     names = sorted(path.name for path in (scene / "images" / "walk").iterdir())[:6]
     for name in names:
         (tmp_path / name.replace(" ", "")).write_bytes((scene / "images" / "walk" / name).read_bytes())
     images = [colmap.SfmImage(name.replace(" ", ""), "photos") for name in names]
     colmap.build_database(tmp_path / "a.db", tmp_path, images, colmap.SfmSettings(max_features=700))
-    model = colmap.map_database(tmp_path / "a.db", tmp_path, seed=0)[0]
+    model = mapping.map_database(tmp_path / "a.db", tmp_path, 0, {"photos": "SIMPLE_RADIAL"}, {})[0].model()
     pairs = colmap.read_pairs(tmp_path / "a.db")
     right = attempts.check_model(model, pairs)
     assert right.passed
@@ -309,7 +338,7 @@ def test_interruption_leaves_nothing(scene, tmp_path, monkeypatch):
         assert list((tmp_path / "work").iterdir())
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(colmap, "map_database", interrupted)
+    monkeypatch.setattr(attempts, "map_database", interrupted)
     with pytest.raises(KeyboardInterrupt):
         calibrate(root, CalibrateConfig(max_features=300))
     assert sorted(path.name for path in root.iterdir()) == ["capture.toml", "images"]

@@ -1,0 +1,250 @@
+"""Adapter of pycolmap: cameras and points from verified matches, for one camera model or refined to another.
+
+The matches are the same for all camera models, so that several are tried on one database. Every seed is set, and one
+thread is used; see `colmap`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Map
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from ...datasets.io.progress import progress
+from ...schemas import CameraIntrinsics
+from .colmap import camera_names, count, run
+from .reconstruction import Array, SfmCamera, SfmModel
+
+_MIN_MODEL_IMAGES = 3
+_LOSS_SCALE = 2.0
+"""Scale of the Cauchy loss, in standard deviations of a coordinate of the residuals."""
+_LEAST_NOISE_PX = 0.1
+"""Lower bound of that standard deviation [px]; without one, exact observations would have no scale."""
+_KEEP_WITHIN = (4.0, 3.0)
+"""Residuals above this many standard deviations are taken for wrong matches, after each of two adjustments."""
+_MEDIAN_OF_RAYLEIGH = 1.1774
+"""Median length of a vector of two normal numbers with standard deviation 1: sqrt(2 ln 2)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mapped:
+    """A connected model as COLMAP has it, and the names of its cameras."""
+
+    reconstruction: Any
+    """pycolmap's reconstruction; `refined` copies it."""
+    names: dict[int, str]
+    """Name of each camera by COLMAP's identifier."""
+
+    @property
+    def image_count(self) -> int:
+        """Number of registered images."""
+        return int(self.reconstruction.num_reg_images())
+
+    def model(self) -> SfmModel:
+        """Return the model as plain arrays."""
+        return _plain_model(self.reconstruction, self.names)
+
+    def residuals_px(self) -> Array:
+        """Return the lengths of the reprojection errors of all observations [px], shape (observation,)."""
+        return np.concatenate([lengths for _, _, lengths in _residuals(self.reconstruction)])
+
+
+def map_database(
+    database: Path, root: Path, seed: int, models: Map[str, str], known: Map[str, CameraIntrinsics]
+) -> list[Mapped]:
+    """Estimate cameras and points from the matches of a database with given camera models.
+
+    Args:
+        database: The database of `colmap.build_database`.
+        root: Folder of the images.
+        seed: Seed of the mapping.
+        models: COLMAP's camera model of each camera: SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV.
+        known: Intrinsics of cameras that are not estimated; they replace the camera's entry in `models`.
+
+    Returns:
+        All connected models, the one with most images first.
+    """
+    names = camera_names(database)
+    fixed = _set_cameras(database, names, models, known)
+    options = _options(seed)
+    options.constant_cameras = fixed
+    options.mapper.constant_cameras = fixed
+    output = database.with_suffix(".models")
+    output.mkdir(exist_ok=True)
+    images = count(database, lambda opened: opened.num_images())
+    with progress(range(images), "mapping", total=images, unit="image") as bar:
+        found = run(
+            pycolmap.incremental_mapping,
+            seed,
+            database_path=database,
+            image_path=root,
+            output_path=output,
+            options=options,
+            next_image_callback=lambda: bar.update(1),
+        )
+    mapped = [Mapped(reconstruction=found[key], names=names) for key in sorted(found)]
+    return sorted(mapped, key=lambda one: -one.image_count)
+
+
+def refined(mapped: Mapped, models: Map[str, str], known: Map[str, CameraIntrinsics], seed: int) -> Mapped:
+    """Adjust a model with other camera models and a loss that wrong matches do not pull, and drop these.
+
+    Args:
+        mapped: The model; it stays as it is.
+        models: Camera model of each camera, at least as rich as the one that it has.
+        known: Intrinsics of cameras that are not estimated.
+        seed: Seed of COLMAP.
+    """
+    copy = pycolmap.Reconstruction(mapped.reconstruction)
+    for identifier, camera in copy.cameras.items():
+        if mapped.names[identifier] not in known:
+            _enrich(camera, models[mapped.names[identifier]])
+    fixed = {identifier for identifier in copy.cameras if mapped.names[identifier] in known}
+    _adjust(copy, fixed, seed)
+    for limit in _KEEP_WITHIN:
+        _drop_outliers(copy, limit)
+        _adjust(copy, fixed, seed)
+    return Mapped(reconstruction=copy, names=mapped.names)
+
+
+def noise_px(residuals_px: Array) -> float:
+    """Return the standard deviation of a coordinate of the residuals from their median length [px]."""
+    return max(float(np.median(residuals_px)) / _MEDIAN_OF_RAYLEIGH, _LEAST_NOISE_PX)
+
+
+def _options(seed: int) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = seed
+    options.mapper.num_threads = 1
+    options.mapper.random_seed = seed
+    options.triangulation.random_seed = seed
+    options.min_model_size = _MIN_MODEL_IMAGES
+    return options
+
+
+def _set_cameras(
+    database: Path, names: Map[int, str], models: Map[str, str], known: Map[str, CameraIntrinsics]
+) -> set[int]:
+    """Write cameras of the wanted models into the database; return the identifiers of those that are known."""
+    opened = pycolmap.Database.open(database)
+    try:
+        for camera in opened.read_all_cameras():
+            name, identifier = names[camera.camera_id], camera.camera_id
+            if name in known:
+                opened.update_camera(_known_camera(identifier, known[name]))
+                continue
+            new = pycolmap.Camera.create_from_model_name(
+                identifier, models[name], camera.mean_focal_length(), camera.width, camera.height
+            )
+            new.has_prior_focal_length = camera.has_prior_focal_length
+            opened.update_camera(new)
+    finally:
+        opened.close()
+    return {identifier for identifier, name in names.items() if name in known}
+
+
+def _known_camera(identifier: int, known: CameraIntrinsics) -> Any:
+    camera = pycolmap.Camera.create_from_model_name(identifier, "OPENCV", known.fx, known.width, known.height)
+    lens = [*known.distortion, 0.0, 0.0, 0.0, 0.0][:4]
+    camera.params = [known.fx, known.fy, known.cx, known.cy, *lens]
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def _enrich(camera: Any, model: str) -> None:
+    """Give a camera another model; what the present one has of lens and principal point is kept."""
+    new = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, model, camera.mean_focal_length(), camera.width, camera.height
+    )
+    values = np.array(new.params)
+    for here, there in (
+        (new.principal_point_idxs(), camera.principal_point_idxs()),
+        (new.extra_params_idxs(), camera.extra_params_idxs()),
+    ):
+        for k, j in zip(here, there, strict=False):  # the leading extra parameters are k1 and k2 in every model
+            values[k] = camera.params[j]
+    camera.model = new.model
+    camera.params = values.tolist()
+
+
+def _adjust(reconstruction: Any, fixed: set[int], seed: int) -> None:
+    lengths = np.concatenate([lengths for _, _, lengths in _residuals(reconstruction)])
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = _LOSS_SCALE * noise_px(lengths)
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in reconstruction.images.values():
+        if image.has_pose:
+            config.add_image(image.image_id)
+    for identifier in fixed & set(reconstruction.cameras):
+        config.set_constant_cam_intrinsics(identifier)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    run(lambda cancellation_token: adjuster.solve(), seed)
+
+
+def _drop_outliers(reconstruction: Any, limit: float) -> None:
+    residuals = _residuals(reconstruction)
+    most = limit * noise_px(np.concatenate([lengths for _, _, lengths in residuals]))
+    for image, observed, lengths in residuals:
+        for index in observed[lengths > most]:
+            if image.points2D[index].has_point3D():  # the point may be gone with its last but one observation
+                reconstruction.delete_observation(image.image_id, int(index))
+
+
+def _residuals(reconstruction: Any) -> list[tuple[Any, Any, Array]]:
+    """Return each registered image with the indices of its observations and their reprojection errors [px]."""
+    found = []
+    for image in sorted(reconstruction.images.values(), key=lambda one: one.image_id):
+        observed = [k for k, point in enumerate(image.points2D) if point.has_point3D()] if image.has_pose else []
+        if not observed:
+            continue
+        seen = np.array([image.points2D[k].xy for k in observed])
+        world = np.array([reconstruction.points3D[image.points2D[k].point3D_id].xyz for k in observed])
+        pose = image.cam_from_world().matrix()
+        drawn = reconstruction.cameras[image.camera_id].img_from_cam(world @ pose[:, :3].T + pose[:, 3])
+        found.append((image, np.array(observed), np.linalg.norm(drawn - seen, axis=1)))
+    return found
+
+
+def _plain_model(model: pycolmap.Reconstruction, camera_names: dict[int, str]) -> SfmModel:
+    model.update_point_3d_errors()
+    point_ids = sorted(model.points3D)
+    index = {point_id: i for i, point_id in enumerate(point_ids)}
+    points = [model.points3D[point_id] for point_id in point_ids]
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    poses, observations = {}, {}
+    for image in images:
+        poses[image.name] = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
+        seen = [point for point in image.points2D if point.has_point3D()]
+        observations[image.name] = (
+            np.array([point.xy for point in seen], dtype=float).reshape(-1, 2),
+            np.array([index[point.point3D_id] for point in seen], dtype=np.int64),
+        )
+    used = {image.camera_id for image in images}
+    return SfmModel(
+        cameras={camera_names[key]: _plain_camera(model.cameras[key]) for key in sorted(used)},
+        image_camera={image.name: camera_names[image.camera_id] for image in images},
+        T_cam_world=poses,
+        points=np.array([point.xyz for point in points], dtype=float).reshape(-1, 3),
+        colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        observations=observations,
+        reprojection_error_px=float(model.compute_mean_reprojection_error()),
+    )
+
+
+def _plain_camera(camera: pycolmap.Camera) -> SfmCamera:
+    focal = [float(value) for value in camera.params[camera.focal_length_idxs()]]
+    cx, cy = (float(value) for value in camera.params[camera.principal_point_idxs()])
+    extra = [float(value) for value in camera.params[camera.extra_params_idxs()]]
+    k1, k2, p1, p2 = [*extra, 0.0, 0.0, 0.0, 0.0][:4]
+    return SfmCamera(
+        width=camera.width, height=camera.height, fx=focal[0], fy=focal[-1], cx=cx, cy=cy, distortion=(k1, k2, p1, p2)
+    )
