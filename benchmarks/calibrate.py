@@ -28,7 +28,7 @@ MANIFEST = 'format = "cgwm-capture/1"\n'
 def make_capture(photos: Path, folder: Path) -> Path:
     """Make a capture of a folder of photos, without copying them."""
     (folder / "images").mkdir(parents=True)
-    for photo in sorted(photos.glob("*.jpg")):
+    for photo in sorted([*photos.glob("*.jpg"), *photos.glob("*.png")]):
         (folder / "images" / photo.name).symlink_to(photo.resolve())
     (folder / "capture.toml").write_text(MANIFEST, encoding="utf-8")
     return folder

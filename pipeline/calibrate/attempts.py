@@ -13,7 +13,7 @@ from ...schemas.calibration import CalibrationAttempt, ImageVerdict, PairFigures
 from . import colmap
 from .camera_models import FIRST_TRIED, LADDER, richer, supported
 from .consistency_check import SelfCheck, check_model
-from .mapping import Mapped, map_database, refined
+from .mapping import Mapped, adjusted, map_database, without_outliers
 from .photos import Inputs
 from .reconstruction import SfmModel, VerifiedPair
 
@@ -157,12 +157,13 @@ def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[SfmModel], 
     if not best:
         return [], ""
     steps = [
-        (model, refined(best[0], _limited(model, inputs), inputs.known, seed))
+        (model, adjusted(best[0], _limited(model, inputs), inputs.known, seed))
         for model in richer(start, "SIMPLE_PINHOLE" if _all_known(inputs) else "OPENCV")
     ]
     free = len(set(best[0].names.values()) - set(inputs.known))
     taken = supported([(model, step.residuals_px()) for model, step in steps], free)
-    return [dict(steps)[taken].model(), *(one.model() for one in best[1:])], taken
+    largest = without_outliers(dict(steps)[taken], inputs.known, seed)
+    return [largest.model(), *(one.model() for one in best[1:])], taken
 
 
 def _limited(model: str, inputs: Inputs) -> dict[str, str]:

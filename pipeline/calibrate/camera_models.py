@@ -41,21 +41,19 @@ def supported(residuals_px: Sequence[tuple[str, Array]], cameras: int) -> str:
     at least 1 %.
 
     Args:
-        residuals_px: Camera models from simple to rich, each with the lengths of its reprojection errors [px].
+        residuals_px: Camera models from simple to rich, each with the lengths of the reprojection
+            errors of the same observations [px].
         cameras: Number of cameras that have such a model.
     """
     noise = noise_px(residuals_px[-1][1])
-    most = max(len(lengths) for _, lengths in residuals_px)
-    taken, least = residuals_px[0][0], _cost(residuals_px[0][1], noise, most)
+    taken, least = residuals_px[0][0], _cost(residuals_px[0][1], noise)
     for model, lengths in residuals_px[1:]:
-        cost = _cost(lengths, noise, most)
-        price = cameras * (LENS_PARAMETERS[model] - LENS_PARAMETERS[taken]) * np.log(2 * most)
+        cost = _cost(lengths, noise)
+        price = cameras * (LENS_PARAMETERS[model] - LENS_PARAMETERS[taken]) * np.log(2 * len(lengths))
         if least - cost > max(price, LEAST_GAIN * least):
             taken, least = model, cost
     return taken
 
 
-def _cost(lengths_px: Array, noise: float, observations: int) -> float:
-    """Return the truncated sum of squares; observations that an adjustment dropped count as truncated."""
-    kept = np.minimum((lengths_px / noise) ** 2, _TRUNCATE**2).sum()
-    return float(kept) + _TRUNCATE**2 * (observations - len(lengths_px))
+def _cost(lengths_px: Array, noise: float) -> float:
+    return float(np.minimum((lengths_px / noise) ** 2, _TRUNCATE**2).sum())

@@ -25,7 +25,7 @@ _LOSS_SCALE = 2.0
 _LEAST_NOISE_PX = 0.1
 """Lower bound of that standard deviation [px]; without one, exact observations would have no scale."""
 _KEEP_WITHIN = (4.0, 3.0)
-"""Residuals above this many standard deviations are taken for wrong matches, after each of two adjustments."""
+"""Residuals above this many standard deviations are taken for wrong matches, in turn, each after an adjustment."""
 _MEDIAN_OF_RAYLEIGH = 1.1774
 """Median length of a vector of two normal numbers with standard deviation 1: sqrt(2 ln 2)."""
 
@@ -35,7 +35,7 @@ class Mapped:
     """A connected model as COLMAP has it, and the names of its cameras."""
 
     reconstruction: Any
-    """pycolmap's reconstruction; `refined` copies it."""
+    """pycolmap's reconstruction; what adjusts it works on a copy."""
     names: dict[int, str]
     """Name of each camera by COLMAP's identifier."""
 
@@ -90,8 +90,8 @@ def map_database(
     return sorted(mapped, key=lambda one: -one.image_count)
 
 
-def refined(mapped: Mapped, models: Map[str, str], known: Map[str, CameraIntrinsics], seed: int) -> Mapped:
-    """Adjust a model with other camera models and a loss that wrong matches do not pull, and drop these.
+def adjusted(mapped: Mapped, models: Map[str, str], known: Map[str, CameraIntrinsics], seed: int) -> Mapped:
+    """Adjust a model with other camera models, and a loss that wrong matches do not pull.
 
     Args:
         mapped: The model; it stays as it is.
@@ -103,11 +103,16 @@ def refined(mapped: Mapped, models: Map[str, str], known: Map[str, CameraIntrins
     for identifier, camera in copy.cameras.items():
         if mapped.names[identifier] not in known:
             _enrich(camera, models[mapped.names[identifier]])
-    fixed = {identifier for identifier in copy.cameras if mapped.names[identifier] in known}
-    _adjust(copy, fixed, seed)
+    _adjust(copy, _fixed(mapped, known), seed)
+    return Mapped(reconstruction=copy, names=mapped.names)
+
+
+def without_outliers(mapped: Mapped, known: Map[str, CameraIntrinsics], seed: int) -> Mapped:
+    """Drop the observations of an adjusted model that are taken for wrong matches, and adjust it again, twice."""
+    copy = pycolmap.Reconstruction(mapped.reconstruction)
     for limit in _KEEP_WITHIN:
         _drop_outliers(copy, limit)
-        _adjust(copy, fixed, seed)
+        _adjust(copy, _fixed(mapped, known), seed)
     return Mapped(reconstruction=copy, names=mapped.names)
 
 
@@ -172,6 +177,10 @@ def _enrich(camera: Any, model: str) -> None:
     camera.params = values.tolist()
 
 
+def _fixed(mapped: Mapped, known: Map[str, CameraIntrinsics]) -> set[int]:
+    return {identifier for identifier in mapped.reconstruction.cameras if mapped.names[identifier] in known}
+
+
 def _adjust(reconstruction: Any, fixed: set[int], seed: int) -> None:
     lengths = np.concatenate([lengths for _, _, lengths in _residuals(reconstruction)])
     options = pycolmap.BundleAdjustmentOptions()
@@ -183,7 +192,7 @@ def _adjust(reconstruction: Any, fixed: set[int], seed: int) -> None:
     for image in reconstruction.images.values():
         if image.has_pose:
             config.add_image(image.image_id)
-    for identifier in fixed & set(reconstruction.cameras):
+    for identifier in fixed:
         config.set_constant_cam_intrinsics(identifier)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)

@@ -1,0 +1,168 @@
+"""Calibrate photos of one object whose cameras are known, beside COLMAP with each single camera model.
+
+Scanned objects are photographed on a turntable and in hand before black, white and cluttered backgrounds
+(`object_photos`). cgwm gets the photos and nothing else. COLMAP gets the same photos with its defaults and each camera
+model in turn; the best of them, chosen with the truth, is the rival. Run with
+
+    python benchmarks/calibrate_objects.py YCB [--objects mustard_bottle,mug] [--seeds 0,1]
+
+where YCB is the folder of the scans, `ycb/ycb` of `ycb.tar.xz`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from calibrate import make_capture
+from cgwm.pipeline.calibrate import calibrate
+from cgwm.pipeline.calibrate.metric_scale import umeyama
+from cgwm.schemas import CalibrateConfig, CamerasFile, NotConvergedError, read_json
+from mesh_photos import scanned
+from object_photos import Session, photograph, poses, write_photos
+from store import Store
+
+OBJECTS = ("mustard_bottle", "power_drill", "banana", "mug", "rubiks_cube")
+LOOKS: tuple[tuple[str, str, float, float, float], ...] = (
+    ("black", "turntable", 1500.0, -0.05, 0.0),
+    ("black", "hand", 800.0, -0.15, 0.3),
+    ("white", "turntable", 800.0, -0.1, 0.3),
+    ("white", "hand", 620.0, -0.2, 0.0),
+    ("clutter", "hand", 620.0, -0.2, 0.0),
+)
+"""Background, motion, focal length [px], radial distortion and gloss."""
+PHOTOS = 48
+RIVALS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+RIGHT_CENTRE_PERCENT, RIGHT_ROTATION_DEG = 0.3, 1.0
+
+
+def sessions(seed: int) -> Iterator[Session]:
+    """Yield the ways in which an object is photographed, with one seed."""
+    for number, (background, motion, focal, k1, gloss) in enumerate(LOOKS):
+        yield Session(
+            count=PHOTOS,
+            focal_px=focal,
+            k1=k1,
+            motion=motion,  # type: ignore[arg-type]
+            background=background,  # type: ignore[arg-type]
+            gloss=gloss,
+            seed=100 * seed + number,
+        )
+
+
+def figures(T_world_cam: dict[str, np.ndarray], truth: np.ndarray) -> dict[str, Any]:
+    """Return how many photos are registered, and the largest errors after a similarity alignment of the centres.
+
+    Args:
+        T_world_cam: Estimated poses (4, 4) by photo, `007.png`.
+        truth: True poses, shape (photo, 4, 4).
+    """
+    if len(T_world_cam) < 3:
+        return {"registered": len(T_world_cam)}
+    index = [int(Path(name).stem) for name in T_world_cam]
+    found, true = np.array(list(T_world_cam.values())), truth[index]
+    aligned = umeyama(found[:, :3, 3], true[:, :3, 3])
+    extent = np.linalg.norm(np.ptp(truth[:, :3, 3], axis=0))
+    centre = np.linalg.norm(aligned.points(found[:, :3, 3]) - true[:, :3, 3], axis=1) / extent
+    turn = np.swapaxes(true[:, :3, :3], 1, 2) @ aligned.rotation @ found[:, :3, :3]
+    angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    return {
+        "registered": len(T_world_cam),
+        "centre_percent": round(100 * float(centre.max()), 3),
+        "rotation_deg": round(float(np.degrees(angle.max())), 3),
+    }
+
+
+def ours(photos: Path, truth: np.ndarray) -> dict[str, Any]:
+    """Calibrate a folder of photos with cgwm."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = make_capture(photos, Path(folder) / "capture")
+        begun = time.process_time()
+        try:
+            report = calibrate(root, CalibrateConfig())
+        except NotConvergedError as error:
+            return {"registered": 0, "refused": str(error).splitlines()[0], "cpu_s": round(time.process_time() - begun)}
+        cameras = read_json(root / "cameras.json", CamerasFile)
+        taken = next(one for one in report.attempts if one.outcome == "taken")
+        more = {"model": taken.camera_model, "attempts": len(report.attempts), "warnings": list(report.warnings)}
+        estimated = {name: np.array(image.T_world_cam) for name, image in cameras.images.items()}
+        estimated = {
+            name: pose if len(pose) == 4 else np.vstack([pose, [0, 0, 0, 1]]) for name, pose in estimated.items()
+        }
+        return figures(estimated, truth) | more | {"cpu_s": round(time.process_time() - begun)}
+
+
+def theirs(photos: Path, truth: np.ndarray, model: str) -> dict[str, Any]:
+    """Run COLMAP's own pipeline with its defaults and one camera model."""
+    with tempfile.TemporaryDirectory() as folder:
+        database, begun = Path(folder) / "a.db", time.process_time()
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = model
+        pycolmap.set_random_seed(0)
+        pycolmap.extract_features(
+            database, photos, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader, device=pycolmap.Device.cpu
+        )
+        pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+        found = pycolmap.incremental_mapping(database, photos, Path(folder))
+        if not found:
+            return {"registered": 0}
+        largest = max(found.values(), key=lambda one: one.num_reg_images())
+        estimated = {}
+        for image in largest.images.values():
+            if image.has_pose:
+                estimated[image.name] = np.linalg.inv(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]))
+        return figures(estimated, truth) | {"cpu_s": round(time.process_time() - begun)}
+
+
+def right(row: dict[str, Any]) -> bool:
+    """Return whether all photos are registered where they were taken."""
+    return (
+        row["registered"] == PHOTOS
+        and row["centre_percent"] <= RIGHT_CENTRE_PERCENT
+        and row["rotation_deg"] <= RIGHT_ROTATION_DEG
+    )
+
+
+def main() -> int:
+    """Print one JSON line a run, and the counts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("ycb", type=Path)
+    parser.add_argument("--objects", default=",".join(OBJECTS))
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--photos", type=Path, default=Path("out/object-photos"), help="where the photos are kept")
+    arguments = parser.parse_args()
+    pycolmap.logging.minloglevel = 3
+    store = Store("calibrate_objects", any_commit=True)
+    rows = []
+    for name in arguments.objects.split(","):
+        painted = scanned(arguments.ycb / name)
+        for seed in (int(value) for value in arguments.seeds.split(",")):
+            for session in sessions(seed):
+                key = f"{name} {session.background} {session.motion} {seed}"
+                folder = (arguments.photos / key.replace(" ", "-")).resolve()
+                if not folder.is_dir():
+                    write_photos(folder.with_suffix(".new"), photograph(painted, session)[0])
+                    folder.with_suffix(".new").rename(folder)
+                truth = np.array(poses(session, painted.mesh))
+                mine = store.result(f"{key} cgwm", lambda p=folder, t=truth: ours(p, t))
+                other = {
+                    model: store.result(f"{key} {model}", lambda p=folder, t=truth, m=model: theirs(p, t, m))
+                    for model in RIVALS
+                }
+                rows.append((right(mine), any(right(row) for row in other.values()), mine))
+    solvable = [row for row in rows if row[1]]
+    print(f"right: cgwm {sum(row[0] for row in rows)} of {len(rows)}, COLMAP with its best model {len(solvable)}")
+    print(f"of these cgwm {sum(row[0] for row in solvable)}")
+    print(f"written but wrong: {sum(not row[0] and row[2]['registered'] > 0 for row in rows)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
