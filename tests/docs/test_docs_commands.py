@@ -137,12 +137,13 @@ def test_the_manifest_is_legal(tmp_path: Path) -> None:
     assert manifest.calibration.markers[0].side_m == 0.08
 
 
-def test_the_scale_in_the_manifest_is_legal(tmp_path: Path) -> None:
-    (text,) = blocks("docs/calibrate.md", "toml")
+def test_camera_and_scale_in_the_manifest_are_legal(tmp_path: Path) -> None:
+    camera, scale = blocks("docs/calibrate.md", "toml")
     path = tmp_path / "capture.toml"
-    path.write_text('format = "cgwm-capture/1"\n' + text)
-    known = read_toml(path, CaptureManifest).calibration.known_distance
-    assert known is not None and known.distance_m == 0.3
+    path.write_text('format = "cgwm-capture/1"\n' + scale + camera)
+    calibration = read_toml(path, CaptureManifest).calibration
+    assert calibration.known_distance is not None and calibration.known_distance.distance_m == 0.3
+    assert calibration.intrinsics[0].fx == 3120.5
 
 
 def test_the_plan_is_legal(tmp_path: Path) -> None:
