@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...schemas import CaptureManifest, Ground, InputDataError
 from .folder import CaptureFolder
+from .surface_distance import surface_distance
 from .tracked_motion import TrackedMotion, outline_of, tracked_motions
 from .unit_mistakes import LENGTHS, ORDERS, Correction, frame_corrections, ground_correction, unit_corrections
 
@@ -162,7 +163,7 @@ def agreement(manifest: CaptureManifest, motions: Sequence[TrackedMotion], corre
 def _contact(
     manifest: CaptureManifest, motion: TrackedMotion, correction: Correction
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return in which windows a body is under the ground, touches the ground or may touch a body, and is on the ground.
+    """Return in which windows a body is under the ground, may touch something, and lies on the ground.
 
     The first two leave room for a tilted frame and for errors of shape and ground; the third does not.
     """
@@ -183,6 +184,10 @@ def _contact(
         between = correction.length * np.linalg.norm(motion.track.position_m - place, axis=1)
         nearest, _ = motion.windows.extremes(between)
         touches = touches | (nearest <= 1.3 * correction.shape * (own + size))
+    if manifest.surfaces:
+        apart = surface_distance(manifest.surfaces, correction.length * motion.track.position_m)
+        nearest, _ = motion.windows.extremes(apart)
+        touches = touches | (nearest <= 1.3 * correction.shape * own)
     return deep, touches, lies
 
 

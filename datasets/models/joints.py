@@ -6,7 +6,10 @@ from collections.abc import Sequence
 
 from ...schemas import Articulation, ArticulationModel, InputDataError
 
-TAKEN_BY = "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval' and 'export --to mjcf' take jointed bodies"
+TAKEN_BY = (
+    "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval', 'synthesize', 'view' and 'export --to mjcf' take "
+    "jointed bodies"
+)
 """What does."""
 
 

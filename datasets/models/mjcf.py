@@ -6,7 +6,7 @@ the same restitution and contact time; the penetration at rest differs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 from xml.etree import ElementTree as ET
@@ -100,23 +100,58 @@ def write_mjcf(
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def mujoco_states(file: ModelFile, time_s: np.ndarray, pose: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Return MuJoCo's states of the free bodies: time, qpos, qvel.
+def mujoco_states(
+    file: ModelFile,
+    time_s: np.ndarray,
+    pose: tuple[np.ndarray, ...],
+    joints: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
+) -> np.ndarray:
+    """Return MuJoCo's states of the free bodies and of jointed ones: time, qpos, qvel.
 
     Args:
         file: The model.
         time_s: Times [s], shape (T,).
         pose: position_m (T, B, 3), quat_wxyz (T, B, 4), velocity_m_s (T, B, 3) of the body origin in world axes, and
             omega_body_rad_s (T, B, 3): a free joint's own convention.
+        joints: Values [rad or m] and rates (T,) of the joints that move, by name.
 
     Returns:
-        Shape (T, 1 + 13 F) for F free bodies.
+        Shape (T, 1 + 13 F + 2 J) for F free bodies and free roots, and J joints.
     """
-    free = [index for index, body in enumerate(file.bodies) if body.motion == "free"]
-    position, quat, velocity, omega = (values[:, free] for values in pose)
-    qpos = np.concatenate([position, quat], -1).reshape(len(time_s), -1)
-    qvel = np.concatenate([velocity, omega], -1).reshape(len(time_s), -1)
-    return np.concatenate([time_s[:, None], qpos, qvel], 1)
+    names = [body.name for body in file.bodies]
+    position, quat, velocity, omega = pose
+    qpos, qvel = [], []
+    for kind, name in state_order(file):
+        if kind == "free":
+            index = names.index(name)
+            qpos += [position[:, index], quat[:, index]]
+            qvel += [velocity[:, index], omega[:, index]]
+        else:
+            value, rate = (joints or {})[name]
+            qpos.append(value[:, None])
+            qvel.append(rate[:, None])
+    return np.concatenate([time_s[:, None], *qpos, *qvel], 1)
+
+
+def state_order(file: ModelFile) -> list[tuple[str, str]]:
+    """Return what MuJoCo's state consists of, in its order: ("free", body) and ("joint", name).
+
+    MuJoCo numbers bodies depth-first, as they are nested in the file.
+    """
+    order = [("free", body.name) for body in file.bodies if body.motion == "free"]
+    for one in file.articulations:
+        order += [("free", one.root)] if one.base == "free" else []
+        order += [("joint", name) for name in _nested_joints(one, one.root)]
+    return order
+
+
+def _nested_joints(one: ArticulationModel, link: str) -> Iterator[str]:
+    """Yield the joints that move, depth-first from a link."""
+    for joint in one.joints:
+        if joint.parent == link:
+            if joint.kind != "fixed":
+                yield joint.name
+            yield from _nested_joints(one, joint.link)
 
 
 def _timestep(file: ModelFile) -> float:

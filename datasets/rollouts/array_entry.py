@@ -40,8 +40,8 @@ class ArrayEntry:
     """Allowed texts; empty: any."""
     unit_norm: bool = False
     """Whether its last axis has the length 1."""
-    presence: Literal["always", "cameras", "optional"] = "always"
-    """Whether every rollout has it, each with cameras, or some."""
+    presence: Literal["always", "cameras", "joints", "optional"] = "always"
+    """Whether every rollout has it, each with cameras, each with jointed bodies, or some."""
 
     @property
     def group(self) -> str:
@@ -89,7 +89,8 @@ SYMBOLS = {
     "B": "bodies",
     "C": "cameras",
     "N": "contacts of all frames together",
-    "D": "1 + 13 x free bodies",
+    "J": "joints that move",
+    "D": "1 + 13 x free bodies, jointed ones by their root, + 2 J",
     "A": "3 x driven bodies, 1 if there are none",
     "H x W": "size of the camera's images",
 }

@@ -14,6 +14,7 @@ _XYZ = {"dtype": "f8", "order": "x y z"}
 _PER_FRAME = {"axes": "(T, B, 3)", **_XYZ}
 _PER_CONTACT = {"axes": "(N,)", "unit": "1"}
 _PER_CAMERA = {"presence": "cameras"}
+_JOINTS = {"presence": "joints"}
 _PICTURE = {"axes": "(T, H, W)", "frame": "image of camera {camera}", "order": "row, column", **_PER_CAMERA}
 _PIXELS = {"axes": "(T, camera, body)", "unit": "px", "frame": "image", "dtype": "i4", "low": "0", **_PER_CAMERA}
 _RGB = {"axes": "(3,)", "unit": "1", "order": "RGB", **_FLOAT, **_PER_CAMERA}
@@ -30,7 +31,7 @@ _TIMELINE = (
     _entry("time", "Time since the rollout's start.", _FLOAT, axes="(T,)", unit="s", note="Frame t is at t / rate."),
     _entry(
         "states",
-        "MuJoCo's state of the attribute model_file (free bodies; velocities linear world, angular body).",
+        "MuJoCo's state of the attribute model_file (free bodies, joints; velocities linear world, angular body).",
         _FLOAT,
         axes="(T, D)",
         unit="SI",
@@ -56,10 +57,17 @@ _BODIES = (
     _entry("bodies/names", "Body k has the value k + 1 in the masks.", axes="(B,)", dtype="S", note="k from 0."),
     _entry(
         "bodies/motions",
-        "free, driven (its track is a command) or fixed.",
+        "free, driven (its track is a command), fixed, or link of a jointed body.",
         axes="(B,)",
         dtype="S",
-        words=("free", "driven", "fixed"),
+        words=("free", "driven", "fixed", "link"),
+    ),
+    _entry(
+        "bodies/materials",
+        "Material, by which pairs have their contact laws; empty: none.",
+        axes="(B,)",
+        dtype="S",
+        presence="optional",
     ),
     _entry("bodies/pos", "Origin of the body frame.", _PER_FRAME, unit="m", frame="world"),
     _entry(
@@ -118,6 +126,38 @@ _BODIES = (
         _FLOAT,
         unit="1",
         high="1",
+    ),
+)
+_JOINT_ARRAYS = (
+    _entry("joints/names", "Joints that move, of all jointed bodies.", _JOINTS, axes="(J,)", dtype="S"),
+    _entry("joints/links", "Body that the joint carries.", _JOINTS, axes="(J,)", dtype="S"),
+    _entry(
+        "joints/kinds",
+        "hinge (values in rad) or slide (in m).",
+        _JOINTS,
+        axes="(J,)",
+        dtype="S",
+        words=("hinge", "slide"),
+    ),
+    _entry(
+        "joints/pos",
+        "Value of the joint.",
+        _JOINTS,
+        _FLOAT,
+        axes="(T, J)",
+        unit="rad, m",
+        frame="joint",
+        order="joints",
+    ),
+    _entry(
+        "joints/vel",
+        "Its rate.",
+        _JOINTS,
+        _FLOAT,
+        axes="(T, J)",
+        unit="rad/s, m/s",
+        frame="joint",
+        order="joints",
     ),
 )
 _CONTACTS = (
@@ -314,7 +354,7 @@ JPEG = _entry(
 
 ARRAYS: dict[str, ArrayEntry] = {
     entry.name: entry
-    for part in (_TIMELINE, _BODIES, _CONTACTS, _PARAMETERS, _CAMERA, _LIGHT, _OBSERVATIONS)
+    for part in (_TIMELINE, _BODIES, _JOINT_ARRAYS, _CONTACTS, _PARAMETERS, _CAMERA, _LIGHT, _OBSERVATIONS)
     for entry in part
 }
 """The arrays of a rollout, by name."""

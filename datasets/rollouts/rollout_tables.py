@@ -12,7 +12,7 @@ from ...schemas import Exposure
 from ..capture.cameras import Camera
 from .array_table import turning
 from .described import new_group, put, write_number, write_text
-from .rollouts import ContactTable, Node, RolloutLabels, RolloutParameter
+from .rollouts import ContactTable, JointTable, Node, RolloutLabels, RolloutParameter
 
 
 def write_tables(demo: Node, labels: RolloutLabels) -> Node:
@@ -20,6 +20,8 @@ def write_tables(demo: Node, labels: RolloutLabels) -> Node:
     _write_attributes(demo, labels, len(labels.time_s))
     _write_timeline(demo, labels)
     _write_bodies(demo, labels)
+    if labels.joints is not None:
+        _write_joints(demo, labels.joints)
     _write_contacts(demo, labels)
     _write_parameters(demo, labels.parameters)
     observations = new_group(demo, "obs")
@@ -59,6 +61,8 @@ def _write_bodies(demo: Node, labels: RolloutLabels) -> None:
     group = new_group(demo, "bodies")
     put(group, "bodies/names", np.array([name.encode() for name in labels.bodies]))
     put(group, "bodies/motions", np.array([motion.encode() for motion in labels.motions]))
+    if labels.materials is not None:
+        put(group, "bodies/materials", np.array([(name or "").encode() for name in labels.materials], "S"))
     put(group, "bodies/pos", labels.position_m)
     put(group, "bodies/quat_wxyz", labels.quat_wxyz)
     put(group, "bodies/vel", labels.velocity_m_s)
@@ -69,6 +73,14 @@ def _write_bodies(demo: Node, labels: RolloutLabels) -> None:
     put(group, "bodies/com", labels.com_m)
     put(group, "bodies/inertia", labels.inertia_kg_m2)
     put(group, "bodies/gravity", labels.gravity_m_s2)
+
+
+def _write_joints(demo: Node, joints: JointTable) -> None:
+    group = new_group(demo, "joints")
+    for name, texts in (("names", joints.names), ("links", joints.links), ("kinds", joints.kinds)):
+        put(group, f"joints/{name}", np.array([text.encode() for text in texts]))
+    put(group, "joints/pos", joints.values)
+    put(group, "joints/vel", joints.speeds)
 
 
 def _write_contacts(demo: Node, labels: RolloutLabels) -> None:

@@ -83,6 +83,22 @@ class RolloutParameter:
 
 
 @dataclass(frozen=True, kw_only=True)
+class JointTable:
+    """The joints of a rollout of T frames; J joints that move."""
+
+    names: tuple[str, ...]
+    """Their names."""
+    links: tuple[str, ...]
+    """The bodies that they carry."""
+    kinds: tuple[str, ...]
+    """hinge or slide."""
+    values: np.ndarray
+    """Values [rad or m], shape (T, J)."""
+    speeds: np.ndarray
+    """Rates [rad/s or m/s], shape (T, J)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RolloutLabels:
     """Everything of one rollout of T frames and B bodies except its images."""
 
@@ -103,7 +119,7 @@ class RolloutLabels:
     bodies: tuple[str, ...]
     """Names of the bodies."""
     motions: tuple[str, ...]
-    """free, driven or fixed, for each body."""
+    """free, driven, fixed or link, for each body."""
     mass_kg: np.ndarray
     """Masses [kg], shape (B,)."""
     com_m: np.ndarray
@@ -140,6 +156,10 @@ class RolloutLabels:
     """Brightness of the light relative to the photos [1], shape (3,)."""
     light: Light | None = None
     """Lamp and sky of this rollout, if the model has them."""
+    materials: tuple[str | None, ...] | None = None
+    """Material of each body; None where no body has one."""
+    joints: JointTable | None = None
+    """The joints of jointed bodies; None without any."""
 
 
 @dataclass(frozen=True)

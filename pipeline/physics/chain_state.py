@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -107,21 +107,26 @@ def on_joints(world: World, state: State) -> State:
 
 
 def joints_of(world: World, state: State, chain: Chain, exact: bool = True) -> tuple[Tensor, Tensor]:
+    """Return the joints of a chain of a world, see `joint_values`."""
+    return joint_values(world.body_names, state, chain, exact)
+
+
+def joint_values(names: Sequence[str], state: State, chain: Chain, exact: bool = True) -> tuple[Tensor, Tensor]:
     """Return values [rad or m] and speeds (B, joints) of the moving joints of a chain, from the poses of its links.
 
     A hinge's value is the one in the middle of its limits, where it has two, plus or minus half a turn; else between
     minus and plus half a turn.
 
     Args:
-        world: The world.
-        state: Poses and velocities of all bodies.
+        names: Names of all bodies.
+        state: Their poses and velocities.
         chain: The chain.
         exact: Whether links that are off their joints are refused; else the nearest values are returned.
 
     Raises:
         InputDataError: If a link is not where its joint admits it, with the environment.
     """
-    rows = [world.body_names.index(name) for name in chain.links]
+    rows = [names.index(name) for name in chain.links]
     values, speeds = [], []
     for joint, row, up in zip(chain.joints, rows[1:], chain.parents[1:], strict=True):
         parent = rows[up]

@@ -12,7 +12,6 @@ import numpy as np
 
 from ...datasets.capture.cameras import Camera
 from ...datasets.io.atomic import sha256
-from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.shards import shard_range
 from ...schemas import DatasetManifest, InputDataError, ModelFile, SamplingPlan, SynthesizeConfig, UsageError
@@ -25,6 +24,7 @@ from .plan import resolve_plan
 from .rejection import Rejection
 from .simulator import Simulator
 from .viewpoints import look_at_cameras
+from .wholes import require_startable
 from .work import LESS, shard_parts, synthesis_parts
 
 STATE_ONLY = (
@@ -77,7 +77,7 @@ def resolved_plan(model: Path, plan: SamplingPlan) -> SamplingPlan:
 
 def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
     model = read_model(path)
-    refuse_joints(model.file.articulations, str(path), "synthesize")
+    require_startable(model)
     lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
     if lacking:
         raise InputDataError(

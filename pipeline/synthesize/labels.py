@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from ...datasets.models.effect_files import packed_name
 from ...datasets.models.mjcf import mujoco_states, write_mjcf
-from ...datasets.rollouts.rollouts import RolloutLabels
+from ...datasets.rollouts.rollouts import JointTable, RolloutLabels
 from ...schemas import ModelFile, SamplingPlan
+from ..physics.chain import chain_of_model
+from ..physics.chain_state import joint_values
 from ..physics.net_contact_wrench import contact_force_n, contact_torque_n_m
+from ..physics.world import State
 from .pusher_paths import commanded_velocity
 from .simulator import Motion
 from .start_states import Start
@@ -31,13 +35,18 @@ def labels_of(motion: Motion, plan: SamplingPlan, seed: int, times_s: np.ndarray
     poses = (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
     inertia = np.array([body.inertia_kg_m2 for body in bodies])
     free = np.array([body.motion == "free" for body in bodies])
+    joints = joint_table(file, poses)
+    known = (
+        {} if joints is None else {n: (joints.values[:, k], joints.speeds[:, k]) for k, n in enumerate(joints.names)}
+    )
+    materials = tuple(body.material for body in bodies)
     return RolloutLabels(
         episode_index=draw.index,
         seed=seed,
         attempt=draw.attempt,
         model_mjcf=write_mjcf(replace(draw.model, file=file), draw.cameras),
         time_s=times_s,
-        states=mujoco_states(file, times_s, poses),
+        states=mujoco_states(file, times_s, poses, known),
         actions=actions,
         action_meaning=meaning,
         bodies=tuple(body.name for body in bodies),
@@ -59,6 +68,36 @@ def labels_of(motion: Motion, plan: SamplingPlan, seed: int, times_s: np.ndarray
         exposures=draw.lighting.exposures,
         light_gain_rgb=draw.lighting.gain_rgb,
         light=draw.lighting.light,
+        materials=materials if any(materials) else None,
+        joints=joints,
+    )
+
+
+def joint_table(file: ModelFile, poses: tuple[np.ndarray, ...]) -> JointTable | None:
+    """Return values and rates of the joints, from the poses and velocities of the links; None without joints.
+
+    A hinge without limits keeps counting where it turns more than once.
+
+    Args:
+        file: The model.
+        poses: position_m (T, B, 3), quat_wxyz (T, B, 4), velocity_m_s (T, B, 3) and omega_body_rad_s (T, B, 3).
+    """
+    if not file.articulations:
+        return None
+    names, state = [body.name for body in file.bodies], State(*map(torch.as_tensor, poses))
+    moving = [joint for one in file.articulations for joint in one.joints if joint.kind != "fixed"]
+    found = [
+        joint_values(names, state, chain_of_model(one, state.position_m), exact=False) for one in file.articulations
+    ]
+    values, speeds = (torch.cat(each, -1).numpy() for each in zip(*found, strict=True))
+    endless = [k for k, joint in enumerate(moving) if joint.kind == "hinge" and None in (joint.lower, joint.upper)]
+    values[:, endless] = np.unwrap(values[:, endless], axis=0)
+    return JointTable(
+        names=tuple(joint.name for joint in moving),
+        links=tuple(joint.link for joint in moving),
+        kinds=tuple(joint.kind for joint in moving),
+        values=values,
+        speeds=speeds,
     )
 
 

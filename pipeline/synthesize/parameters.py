@@ -14,6 +14,7 @@ from scipy.special import ndtr, ndtri
 from ...datasets.models.model import Model
 from ...datasets.rollouts.rollouts import RolloutParameter
 from ...schemas import (
+    ArticulationModel,
     BodyModel,
     ContactParameters,
     Correlation,
@@ -21,6 +22,7 @@ from ...schemas import (
     EffectModel,
     FittedParameter,
     InputDataError,
+    JointModel,
     ModelFile,
     did_you_mean,
     parse,
@@ -30,6 +32,8 @@ from ..physics.contact_law import restitution
 from ..physics.effects.registry import effect_of
 from .distributions import draw
 
+LOSSES = ("damping", "friction")
+"""Numbers of a joint that a fit estimates."""
 _UNITS = {"friction": "1", "contact_time_s": "s", "damping_ratio": "1", "ground_offset_m": "m", "mass_kg": "kg"}
 
 
@@ -137,6 +141,7 @@ def settable(file: ModelFile) -> list[str]:
     names += [*ContactParameters.model_fields, "ground_offset_m"]
     names += [of_pair(name, entry.materials) for entry in file.pairs for name in ContactParameters.model_fields]
     names += [f"{body.name}.{key}" for body in file.bodies for key in ("mass_kg", "com_x_m", "com_y_m", "com_z_m")]
+    names += [f"{joint.name}.{key}" for joint in _moving_joints(file) for key in LOSSES]
     names += [f"{_own_name(effect)}.{key}" for effect in file.effects for key in effect.parameters]
     return [name for name in dict.fromkeys(names) if can_vary(file, name)]
 
@@ -162,6 +167,10 @@ def _bounds(file: ModelFile, name: str) -> tuple[float, float]:
 
 def _unit(file: ModelFile, name: str) -> str:
     owner, _, number = name.rpartition(".")
+    joint = _joint_of(file, name)
+    if joint is not None:
+        turns = joint.kind == "hinge"
+        return {"damping": "N m s/rad" if turns else "N s/m", "friction": "N m" if turns else "N"}[number]
     for effect in file.effects:
         loaded = effect_of(effect)
         for entry in (*loaded.parameters, *loaded.constants) if loaded.name == owner else ():
@@ -180,6 +189,9 @@ def _present(file: ModelFile, name: str) -> float:
     found = _of_pair(file, name)
     if found is not None:
         return getattr(file.pairs[found[0]], found[1])
+    joint = _joint_of(file, name)
+    if joint is not None:
+        return getattr(joint, name.rpartition(".")[2])
     owner, _, number = name.partition(".")
     for effect in file.effects:
         if _own_name(effect) == owner:
@@ -231,6 +243,8 @@ def can_vary(file: ModelFile, name: str) -> bool:
     owner, _, number = name.partition(".")
     if any(_own_name(effect) == owner and number in effect.parameters for effect in file.effects):
         return True
+    if _joint_of(file, name) is not None or _factor_of(file, name) is not None:
+        return True
     legal = ("mass_kg", *(f"com_{axis}_m" for axis in "xyz"))
     moments = tuple(f"moment_{axis}" for axis in "xyz") if any(p.name == name for p in file.parameters) else ()
     return number in (*legal, *moments) and any(body.name == owner for body in file.bodies)
@@ -243,6 +257,59 @@ def _of_pair(file: ModelFile, name: str) -> tuple[int, str] | None:
             if name == of_pair(number, entry.materials):
                 return index, number
     return None
+
+
+def _moving_joints(file: ModelFile) -> list[JointModel]:
+    return [joint for one in file.articulations for joint in one.joints if joint.kind != "fixed"]
+
+
+def _joint_of(file: ModelFile, name: str) -> JointModel | None:
+    """Return the joint whose damping or dry friction a parameter is, else None."""
+    owner, _, number = name.rpartition(".")
+    return next((joint for joint in _moving_joints(file) if joint.name == owner and number in LOSSES), None)
+
+
+def _factor_of(file: ModelFile, name: str) -> ArticulationModel | None:
+    """Return the jointed body of a fitted share of mass, by its link, or factor of inertia, by its name; else None."""
+    owner, _, number = name.rpartition(".")
+    if not any(parameter.name == name for parameter in file.parameters):
+        return None
+    for one in file.articulations:
+        if (number == "mass_factor" and owner in one.links) or (number == "inertia_factor" and owner == one.name):
+            return one
+    return None
+
+
+def _with_loss(file: ModelFile, joint: JointModel, number: str, value: float) -> ModelFile:
+    changed = joint.model_copy(update={number: value})
+    articulations = tuple(
+        one.model_copy(update={"joints": tuple(changed if each is joint else each for each in one.joints)})
+        for one in file.articulations
+    )
+    return file.model_copy(update={"articulations": articulations})
+
+
+def _with_factor(file: ModelFile, one: ArticulationModel, name: str, value: float) -> ModelFile:
+    """Return the model with a share of mass, all masses together kept, or with a factor of all inertias.
+
+    The model contains the estimate, so that the ratio to it counts.
+    """
+    owner, _, number = name.rpartition(".")
+    ratio = value / next(parameter.estimate for parameter in file.parameters if parameter.name == name)
+    links = [body for body in file.bodies if body.name in one.moving_links]
+    if number == "inertia_factor":
+        shares = {body.name: (1.0, ratio) for body in links}
+    else:
+        raw = {body.name: body.mass_kg * (ratio if body.name == owner else 1.0) for body in links}
+        scale = sum(body.mass_kg for body in links) / sum(raw.values())
+        shares = {body.name: (raw[body.name] * scale / body.mass_kg,) * 2 for body in links}
+    bodies = tuple(_scaled(body, *shares.get(body.name, (1.0, 1.0))) for body in file.bodies)
+    return file.model_copy(update={"bodies": bodies})
+
+
+def _scaled(body: BodyModel, mass: float, inertia: float) -> BodyModel:
+    moments = tuple(entry * inertia for entry in body.inertia_kg_m2)
+    return body.model_copy(update={"mass_kg": body.mass_kg * mass, "inertia_kg_m2": moments})
 
 
 def _own_name(effect: EffectModel) -> str:
@@ -270,6 +337,11 @@ def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:
         pairs = list(file.pairs)
         pairs[found[0]] = pairs[found[0]].model_copy(update={found[1]: value})
         return file.model_copy(update={"pairs": tuple(pairs)})
+    joint, factor = _joint_of(file, name), _factor_of(file, name)
+    if joint is not None:
+        return _with_loss(file, joint, name.rpartition(".")[2], value)
+    if factor is not None:
+        return _with_factor(file, factor, name, value)
     owner, _, number = name.partition(".")
     effects = tuple(
         effect.model_copy(update={"parameters": {**effect.parameters, number: value}})

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...datasets.models.model import Model
 from ...schemas import BodyModel, Distribution, InputDataError, ModelFile, SamplingPlan, UsageError
+from .wholes import at_middle
 
 GRAVITY_M_S2 = 9.81
 """Gravity for the default speeds of a model without gravity [m/s2]."""
@@ -28,6 +29,8 @@ class Extent:
 def extent(model: Model, body: BodyModel) -> Extent:
     """Return the bounding sphere of a body, centred at the middle of its collision spheres."""
     spheres = model.collision[body.name]
+    if not len(spheres):
+        return Extent(np.zeros(3), 0.0)
     means = np.asarray(spheres.means, float)
     radii = np.asarray(spheres.scales, float) * body.radius_factor
     center = 0.5 * ((means - radii[:, None]).min(0) + (means + radii[:, None]).max(0))
@@ -51,6 +54,18 @@ def horizontal_direction(up: np.ndarray, angle: float) -> np.ndarray:
     return math.cos(angle) * first + math.sin(angle) * np.cross(up, first)
 
 
+def moving_wholes(whole: Model, file: ModelFile) -> list[BodyModel]:
+    """Return the bodies that start anywhere, or where there are none the jointed ones, which move about a fixed root.
+
+    Args:
+        whole: The model with each jointed body as one, see `wholes.at_middle`.
+        file: The model.
+    """
+    roots = {one.root for one in file.articulations}
+    free = [body for body in whole.file.bodies if body.motion == "free"]
+    return free or [body for body in whole.file.bodies if body.name in roots]
+
+
 def resolve_plan(model: Model, plan: SamplingPlan) -> SamplingPlan:
     """Return the plan with its missing entries filled in from the size of the free bodies.
 
@@ -58,8 +73,8 @@ def resolve_plan(model: Model, plan: SamplingPlan) -> SamplingPlan:
         InputDataError: If the model has no free body, or the plan requires a ground and the model has none.
     """
     file = model.file
-    radii = [extent(model, body).radius_m for body in file.bodies if body.motion == "free"]
-    if not radii:
+    radii = [extent(whole, body).radius_m for whole in (at_middle(model),) for body in moving_wholes(whole, file)]
+    if not radii or not file.tracked:
         raise InputDataError(
             f"{model.place}: no body is free, so there is nothing to simulate.",
             'a body with the motion "free".',

@@ -45,23 +45,27 @@ class Rejection:
     """Centres of the bounding spheres at the poses of the photos [m], world frame, shape (B, 3)."""
     up: np.ndarray
     """Normal of the ground, world frame, shape (3,)."""
+    moved: tuple[bool, ...]
+    """Whether physics moves each body: free ones, and links that a joint or a free root moves."""
 
     @staticmethod
     def of(model: Model, rules: RejectionRules) -> Rejection:
         """Prepare the rules for a model."""
         extents = tuple(extent(model, body) for body in model.file.bodies)
-        poses = [body.photo_pose for body in model.file.bodies]
+        roots = {link: model.body(one.root) for one in model.file.articulations for link in one.links}
+        poses = [roots.get(body.name, body).photo_pose for body in model.file.bodies]
         home = np.array(
             [
                 rotation_matrix(np.array(pose.quat_wxyz)) @ size.center_m + pose.position_m
                 for pose, size in zip(poses, extents, strict=True)
             ]
         )
-        return Rejection(rules, extents, home, up_direction(model.file))
+        moved = tuple(body.name in model.file.tracked for body in model.file.bodies)
+        return Rejection(rules, extents, home, up_direction(model.file), moved)
 
     def reason(self, labels: RolloutLabels) -> str | None:
         """Return the name of the first rule that a rollout violates; None if it is accepted."""
-        free = [index for index, motion in enumerate(labels.motions) if motion == "free"]
+        free = [index for index, moved in enumerate(self.moved) if moved]
         centers = {
             index: labels.position_m[:, index]
             + rotation_matrix(labels.quat_wxyz[:, index]) @ self.extents[index].center_m

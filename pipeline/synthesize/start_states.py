@@ -6,7 +6,7 @@ Fixed values consume no random number, so a rollout keeps its draws when a plan 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,14 +14,16 @@ from scipy.spatial.transform import Rotation
 from ...datasets.capture.tracks import Track
 from ...datasets.models.model import Model
 from ...schemas import BodyModel, Distribution, NotConvergedError, SamplingPlan
+from ...schemas.articulations import JointModel
 from ..geometry.viewpoint import rotation_matrix
 from .distributions import draw
 from .plan import Extent, StartRanges, extent, horizontal_direction, up_direction
 from .pusher_paths import commanded_velocity, push_track
 from .supports import Supports
+from .wholes import JointedStart, put_links, with_wholes
 
-MAX_PLACEMENTS = 200
-"""Maximum number of draws of a start without overlap."""
+MAX_PLACEMENTS, MAX_RESTARTS = 1000, 20
+"""Maximum number of draws of a body's start without overlap, and after how many parts of them all begin anew."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,8 +45,9 @@ class Start:
 def draw_start(model: Model, plan: SamplingPlan, duration_s: float, rng: np.random.Generator) -> Start:
     """Draw the initial state of all bodies and the motion of the driven ones.
 
-    Free bodies are thrown (with a drawn orientation, height, velocity and spin), rest as in the photos but turned about
-    the vertical, or slide from there. Each driven body moves towards a randomly chosen free body.
+    Free bodies, jointed ones as wholes with drawn joints, are thrown (with a drawn orientation, height, velocity and
+    spin), rest as in the photos but turned about the vertical, or slide from there. Each driven body moves towards a
+    randomly chosen free body.
 
     Args:
         model: The model with this rollout's parameters.
@@ -52,6 +55,36 @@ def draw_start(model: Model, plan: SamplingPlan, duration_s: float, rng: np.rand
         duration_s: Length of the rollout [s].
         rng: Source of randomness.
     """
+    if not model.file.articulations:
+        return _drawn(model, plan, duration_s, rng)
+    joints = _joints(model, plan, rng)
+    start = _drawn(with_wholes(model, joints), plan, duration_s, rng)
+    arrays = (start.position_m, start.quat_wxyz, start.velocity_m_s, start.omega_body_rad_s)
+    put_links(arrays, [body.name for body in model.file.bodies], joints)
+    return start
+
+
+def _joints(model: Model, plan: SamplingPlan, rng: np.random.Generator) -> list[JointedStart]:
+    """Draw values between the limits, or of hinges without limits any, and rates up to the plan's spin if thrown."""
+    spin, found = StartRanges.of(plan).spin_rad_s, []
+    for entry in model.file.articulations:
+        one = JointedStart.of(entry, lambda joint: _joint_value(joint, rng))
+        if plan.start == "throw":
+            hinges = np.array([joint.kind == "hinge" for joint in entry.joints if joint.kind != "fixed"])
+            sizes = np.array([draw(spin, rng) for _ in hinges])
+            one = replace(one, speeds=np.where(hinges, sizes * rng.choice([-1.0, 1.0], len(hinges)), 0.0))
+        found.append(one)
+    return found
+
+
+def _joint_value(joint: JointModel, rng: np.random.Generator) -> float:
+    low = -math.pi if joint.lower is None else joint.lower
+    high = math.pi if joint.upper is None else joint.upper
+    return float(rng.uniform(low, high))
+
+
+def _drawn(model: Model, plan: SamplingPlan, duration_s: float, rng: np.random.Generator) -> Start:
+    """Draw the start of a model in which jointed bodies are wholes."""
     bodies = model.file.bodies
     count = len(bodies)
     start = Start(
@@ -71,8 +104,9 @@ def draw_start(model: Model, plan: SamplingPlan, duration_s: float, rng: np.rand
             _rest(start, index, model, plan, rng)
     else:
         _place_apart(start, free, model, plan, extents, rng)
+    targets = free or [index for index, body in enumerate(bodies) if body.motion == "fixed"]
     for index in driven:
-        target = free[int(rng.integers(len(free)))]
+        target = targets[int(rng.integers(len(targets)))]
         _push(start, index, target, model, plan, extents, duration_s, rng)
     return start
 
@@ -80,24 +114,29 @@ def draw_start(model: Model, plan: SamplingPlan, duration_s: float, rng: np.rand
 def _place_apart(
     start: Start, free: list[int], model: Model, plan: SamplingPlan, extents: list[Extent], rng: np.random.Generator
 ) -> None:
-    """Place the free bodies; draw again until no bounding spheres overlap, and none of a thrown body a surface."""
+    """Place the free bodies one after the other; draw each again until its bounding sphere overlaps nothing.
+
+    A thrown one keeps clear of surfaces, too. Where one finds no place among those before it, all begin anew.
+    """
     supports = Supports.of(model)
-    for _ in range(MAX_PLACEMENTS):
-        for index in free:
-            if plan.start == "throw":
-                _throw(start, index, model, plan, extents[index], rng)
-            else:
-                _rest(start, index, model, plan, rng)
-            if plan.start == "slide":
-                _slide(start, index, model, plan, extents[index], rng)
-        centers = [_center(start, index, extents[index]) for index in range(len(extents))]
-        # Driven bodies are placed afterwards, relative to the free ones.
-        others = [index for index, body in enumerate(model.file.bodies) if body.motion != "driven"]
-        pairs = [(a, b) for a in free for b in others if a != b]
-        apart = all(
-            np.linalg.norm(centers[a] - centers[b]) > extents[a].radius_m + extents[b].radius_m for a, b in pairs
-        )
-        if apart and not (plan.start == "throw" and _in_surfaces(supports, free, centers, extents)):
+    # driven bodies are placed afterwards, relative to the free ones
+    still = [index for index, body in enumerate(model.file.bodies) if body.motion not in ("free", "driven", "link")]
+
+    def placed(index: int, others: list[int]) -> bool:
+        for _ in range(MAX_PLACEMENTS // MAX_RESTARTS):
+            _place_one(start, index, model, plan, extents[index], rng)
+            center = _center(start, index, extents[index])
+            apart = all(
+                np.linalg.norm(center - _center(start, other, extents[other]))
+                > extents[index].radius_m + extents[other].radius_m
+                for other in others
+            )
+            if apart and not (plan.start == "throw" and _in_surfaces(supports, center, extents[index])):
+                return True
+        return False
+
+    for _ in range(MAX_RESTARTS):
+        if all(placed(index, still + free[:number]) for number, index in enumerate(free)):
             return
     raise NotConvergedError(
         f"{plan.source}: no start without overlap in {MAX_PLACEMENTS} draws for {len(free)} free bodies.",
@@ -105,14 +144,22 @@ def _place_apart(
     )
 
 
-def _in_surfaces(supports: Supports, free: list[int], centers: list[np.ndarray], extents: list[Extent]) -> bool:
-    """Return whether the bounding sphere of a free body overlaps a surface."""
+def _place_one(
+    start: Start, index: int, model: Model, plan: SamplingPlan, size: Extent, rng: np.random.Generator
+) -> None:
+    if plan.start == "throw":
+        _throw(start, index, model, plan, size, rng)
+    else:
+        _rest(start, index, model, plan, rng)
+    if plan.start == "slide":
+        _slide(start, index, model, plan, size, rng)
+
+
+def _in_surfaces(supports: Supports, center: np.ndarray, size: Extent) -> bool:
+    """Return whether the bounding sphere of a body overlaps a surface."""
     if not supports.surfaces:
         return False
-    one = np.zeros((1, 3))
-    return any(
-        bool(supports.overlaps(centers[index][None], one, np.array([extents[index].radius_m])).any()) for index in free
-    )
+    return bool(supports.overlaps(center[None], np.zeros((1, 3)), np.array([size.radius_m])).any())
 
 
 def _throw(start: Start, index: int, model: Model, plan: SamplingPlan, size: Extent, rng: np.random.Generator) -> None:

@@ -14,7 +14,8 @@ from ...datasets.models.model import Model
 from ...schemas import SamplingPlan, SynthesizeConfig
 from ..geometry.viewpoint import look_at
 from .distributions import draw
-from .plan import StartRanges, extent, horizontal_direction, up_direction
+from .plan import StartRanges, extent, horizontal_direction, moving_wholes, up_direction
+from .wholes import at_middle
 
 
 def look_at_cameras(
@@ -33,8 +34,9 @@ def look_at_cameras(
     ranges = StartRanges.of(plan)
     rng = rng or np.random.default_rng(0)
     file, up = model.file, up_direction(model.file)
-    free = [body for body in file.bodies if body.motion == "free"]
-    radius = max(extent(model, body).radius_m for body in free)
+    whole = at_middle(model)
+    free = moving_wholes(whole, file)
+    radius = max(extent(whole, body).radius_m for body in free)
     middle = np.mean([body.photo_pose.position_m for body in free], axis=0)
     thrown = ranges.start == "throw"
     top = ranges.height_m.support[1] + 2 * radius if thrown else 3 * radius

@@ -77,7 +77,7 @@ def check_arrays(
     names, cameras = _names(found, dataset, faults)
     expected = {array.name: array for array in _expected(found, attributes, cameras)}
     values: dict[str, np.ndarray] = {}
-    symbols = _symbols(found, attributes, names, cameras)
+    symbols = _symbols(found, attributes, dataset, names, cameras)
     wrong = [fault for array in expected.values() for fault in _shape_faults(array, found, symbols)]
     wrong += _size_faults(found, dataset, cameras, symbols)
     if wrong or faults:
@@ -162,7 +162,9 @@ def _expected(found: _Found, attributes: Attributes, cameras: list[str]) -> Iter
     """Yield the arrays that a rollout with these attributes and cameras has to contain."""
     light = {"light/lamp", "light/sky"} & found.arrays.keys()
     for name, entry in ARRAYS.items():
-        if entry.presence == "optional" and not (light and name.startswith("light/")):
+        if entry.presence == "optional" and not (name in found.arrays or (light and name.startswith("light/"))):
+            continue
+        if entry.presence == "joints" and not (b"link" in _motions(found) or "joints" in found.groups):
             continue
         if "{parameter}" in name:
             for parameter, (_, unit) in attributes.parameters.items():
@@ -176,15 +178,27 @@ def _expected(found: _Found, attributes: Attributes, cameras: list[str]) -> Iter
             yield _Expected(entry=entry, words={"turning": turning(attributes.effects)})
 
 
-def _symbols(found: _Found, attributes: Attributes, names: list[str], cameras: list[str]) -> dict[str, int]:
+def _motions(found: _Found) -> list[bytes]:
+    """Return how the bodies move, as far as it can be read."""
+    item = found.arrays.get("bodies/motions")
+    if item is None or item.dtype.kind != "S" or item.ndim != 1 or item.nbytes > MOST_NAME_BYTES:
+        return []
+    return item[()].tolist()
+
+
+def _symbols(
+    found: _Found, attributes: Attributes, dataset: Dataset, names: list[str], cameras: list[str]
+) -> dict[str, int]:
     """Return the values of the letters in shapes and bounds that are known."""
     symbols = {"T": attributes.frames, "B": len(names), "body": len(names)}
     symbols |= {"C": len(cameras), "camera": len(cameras)}
-    motions, rows = found.arrays.get("bodies/motions"), found.arrays.get("contacts/body_a")
-    whole = motions is not None and motions.dtype.kind == "S" and motions.shape == (len(names),)
-    if motions is not None and whole and motions.nbytes <= MOST_NAME_BYTES:
-        kinds = motions[()].tolist()
-        symbols |= {"D": 1 + 13 * kinds.count(b"free"), "A": max(1, 3 * kinds.count(b"driven"))}
+    rows, joints, kinds = found.arrays.get("contacts/body_a"), found.arrays.get("joints/names"), _motions(found)
+    count = len(joints) if joints is not None and joints.ndim == 1 else 0
+    if len(kinds) == len(names):
+        symbols |= {"J": count, "A": max(1, 3 * kinds.count(b"driven"))}
+        roots = [] if dataset.model is None else [one.base for one in dataset.model.file.articulations]
+        if b"link" not in kinds or roots:
+            symbols["D"] = 1 + 13 * (kinds.count(b"free") + roots.count("free")) + 2 * count
     if rows is not None and rows.ndim == 1:
         symbols["N"] = len(rows)
     for camera in cameras:

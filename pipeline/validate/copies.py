@@ -8,6 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from ...datasets.models.mjcf import mujoco_states, state_order
 from ...datasets.rollouts.array_table import ARRAYS
 from .faults import Fault
 from .rollout import Rollout, own_member, shown
@@ -38,15 +39,14 @@ def check_copies(rollout: Rollout) -> Iterator[Fault]:
     """Compare `states`, `obs/object`, `actions`, `dones` and `parameters/` with what they repeat."""
     values, bodies = rollout.values, rollout.part("bodies")
     kinds, time = bodies["motions"].tolist(), values["time"]
-    free = [index for index, kind in enumerate(kinds) if kind == b"free"]
     pose = np.concatenate([bodies["pos"], bodies["quat_wxyz"]], axis=-1)
     speed = np.concatenate([bodies["vel"], bodies["omega_body"]], axis=-1)
     count = len(time)
-    qpos, qvel = (part[:, free].reshape(count, -1) for part in (pose, speed))
     dones = np.zeros(count)
     dones[-1] = 1
+    states, also = _states(rollout, kinds), " and joints'" if b"link" in kinds else ""
     copies = [
-        ("states", np.concatenate([time[:, None], qpos, qvel], axis=1), "the times and the free bodies'"),
+        *([] if states is None else [("states", states, f"the times and the free bodies'{also}")]),
         ("obs/object", np.concatenate([pose, speed], axis=-1).reshape(count, -1), "the bodies'"),
     ]
     for name, wanted, whose in copies:
@@ -61,6 +61,23 @@ def check_copies(rollout: Rollout) -> Iterator[Fault]:
             text = f"parameters/{shown(name)}: {found:g} {shown(unit)}; params_json says {value:g}."
             yield Fault(check="schema", text=text, value=found, limit=value)
     yield from _model_faults(rollout, kinds)
+
+
+def _states(rollout: Rollout, kinds: list[bytes]) -> np.ndarray | None:
+    """Return what `states` repeats; None for jointed bodies whose model cannot be read."""
+    values, model = rollout.values, rollout.dataset.model
+    poses = tuple(values[f"bodies/{name}"] for name in ("pos", "quat_wxyz", "vel", "omega_body"))
+    if b"link" not in kinds:
+        free, count = [index for index, kind in enumerate(kinds) if kind == b"free"], len(values["time"])
+        parts = (np.concatenate([poses[k], poses[k + 1]], -1)[:, free].reshape(count, -1) for k in (0, 2))
+        return np.concatenate([values["time"][:, None], *parts], axis=1)
+    if model is None or tuple(body.name for body in model.file.bodies) != rollout.bodies:
+        return None
+    names = [name.decode("utf-8", "replace") for name in values["joints/names"].tolist()]
+    if set(names) != {name for kind, name in state_order(model.file) if kind == "joint"}:
+        return None  # said by the check of joints
+    pairs = {name: (values["joints/pos"][:, k], values["joints/vel"][:, k]) for k, name in enumerate(names)}
+    return mujoco_states(model.file, values["time"], poses, pairs)
 
 
 def _difference(name: str, found: np.ndarray, wanted: np.ndarray, what: str) -> Iterator[Fault]:

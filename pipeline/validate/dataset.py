@@ -18,6 +18,7 @@ from ...datasets.rollouts.shards import shard_range, span
 from ...schemas import DatasetManifest, Failure, InputDataError, ShardEntry, UsageError, ValidationReport
 from .contacts import check_contacts
 from .faults import Fault
+from .joints import check_joints
 from .newton import MotionFindings, check_motion, motion_facts
 from .reprojection import PictureFindings, check_pictures, picture_facts
 from .rollout import Dataset, Rollout
@@ -217,6 +218,7 @@ def _check_demo(demo: Node, name: str, dataset: Dataset, findings: _Findings) ->
     if any(fault.check == "time" for fault in faults):
         return
     yield from _check_parameters(rollout)
+    yield from check_joints(rollout)
     if has_usable_contacts(rollout):
         yield from check_contacts(rollout)
         yield from check_motion(rollout, findings.motion)

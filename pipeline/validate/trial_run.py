@@ -12,6 +12,7 @@ from ...datasets.models.effect_files import packed_name
 from ...datasets.models.model import Model
 from ...schemas import CgwmError, InputDataError, ModelFile
 from ..geometry.rotation import quat_to_matrix
+from ..physics.chain_state import with_joints
 from ..physics.checks import require_apart
 from ..physics.effects.registry import BUILT_IN
 from ..physics.engine import rollout
@@ -35,14 +36,12 @@ def run_faults(model: Model) -> tuple[list[str], dict[str, str]]:
     """Simulate a model, and return what goes wrong, as sentences, and the facts of the run.
 
     Free bodies fall from where they were in the photos, or from a body's diameter above the ground where that is
-    higher; driven bodies stand still. Effects that are not built in are left out, so that nothing of the model is
-    executed.
+    higher, jointed ones with their joints in the middle of their limits; driven bodies stand still. Effects that are
+    not built in are left out, so that nothing of the model is executed.
     """
     file = _still(model.file)
-    if file.contact is None or not any(body.motion == "free" for body in file.bodies):
+    if file.contact is None or not file.tracked:
         return [], {}
-    if file.articulations:
-        return [], {"simulated": "no: it has jointed bodies"}
     facts = {}
     if len(file.effects) < len(model.file.effects):
         left_out = [packed_name(effect.name) for effect in model.file.effects if effect not in file.effects]
@@ -50,7 +49,7 @@ def run_faults(model: Model) -> tuple[list[str], dict[str, str]]:
     try:
         with torch.no_grad():
             world = World.from_model(replace(model, file=file))
-            state = _start(world)
+            state = _start(world, file)
             thin = thin_wall_warnings(world)
             _require_own_values(model, file, world)
             result = _simulated(world, state)
@@ -71,7 +70,10 @@ def _still(file: ModelFile) -> ModelFile:
         body.model_copy(update={"motion": "fixed"}) if body.motion == "driven" else body for body in file.bodies
     )
     effects = tuple(effect for effect in file.effects if effect.name.partition("@")[0] in BUILT_IN)
-    return file.model_copy(update={"bodies": bodies, "effects": effects})
+    still = tuple(
+        one.model_copy(update={"base": "fixed"}) if one.base == "driven" else one for one in file.articulations
+    )
+    return file.model_copy(update={"bodies": bodies, "effects": effects, "articulations": still})
 
 
 def _require_own_values(model: Model, file: ModelFile, world: World) -> None:
@@ -84,18 +86,43 @@ def _require_own_values(model: Model, file: ModelFile, world: World) -> None:
             World.from_model(own, geometry=world)
 
 
-def _start(world: World) -> State:
+def _start(world: World, file: ModelFile) -> State:
     """Return the bodies at rest, the free ones high enough above the ground."""
-    places = torch.cat([body.place for body in world.bodies if body.place is not None])
+    poses = [body.photo_pose for body in file.bodies]
+    places = torch.tensor([[*pose.position_m, *pose.quat_wxyz] for pose in poses], dtype=torch.float64)
     position, quat = places[None, :, :3].clone(), places[None, :, 3:].clone()
+    state = _jointed(world, State(position, quat, torch.zeros_like(position), torch.zeros_like(position)))
     if world.ground_normal is not None:
-        normal, offset = world.ground
-        for index in world.free:
-            body = world.bodies[index]
-            centers = (quat_to_matrix(quat[:, index]) @ body.centers[0].T)[0].T + position[0, index]
-            lowest = (centers @ normal - body.radii[0]).min() - offset[0]
-            position[0, index] += normal * (_diameter(world, index) - lowest).clamp_min(0.0)
-    return State(position, quat, torch.zeros_like(position), torch.zeros_like(position))
+        groups = [[index] for index in world.free]
+        groups += [[world.body_names.index(k) for k in chain.links] for chain in world.chains if chain.base == "free"]
+        for group in groups:
+            state.position_m[0, group] += world.ground[0] * _lift(world, state, group)
+    return state
+
+
+def _jointed(world: World, state: State) -> State:
+    """Return the state with the joints in the middle of their limits, or at 0 where they have none."""
+    middles = {}
+    for joint in (joint for chain in world.chains for joint in chain.moving):
+        middle = 0.5 * (joint.lower + joint.upper)
+        middles[joint.name] = torch.where(torch.isfinite(middle), middle, torch.zeros_like(middle))
+    return with_joints(world, state, middles) if middles else state
+
+
+def _lift(world: World, state: State, group: list[int]) -> Tensor:
+    """Return by how much bodies have to be raised together to be their diameter above the ground [m]."""
+    normal, offset = world.ground
+    lowest, diameter = [], []
+    for index in group:
+        body = world.bodies[index]
+        if not body.radii.shape[-1]:
+            continue
+        centers = (quat_to_matrix(state.quat_wxyz[:, index]) @ body.centers[0].T)[0].T + state.position_m[0, index]
+        lowest.append((centers @ normal - body.radii[0]).min() - offset[0])
+        diameter.append(_diameter(world, index))
+    if not lowest:
+        return torch.zeros(())
+    return (torch.stack(diameter).max() - torch.stack(lowest).min()).clamp_min(0.0)
 
 
 def _diameter(world: World, index: int) -> Tensor:
@@ -123,11 +150,11 @@ def _fault(world: World, state: State, result: Rollout) -> str | None:
         require_apart(world, state)
     except InputDataError:
         return None  # bodies that begin deep inside each other are thrown apart
-    energy = torch.stack([_energy(world, index, result) for index in world.free]).sum(0)
+    energy = torch.stack([_energy(world, index, result) for index in world.tracked]).sum(0)
     gain = float((energy - energy[0]).max())
     speed = EFFECT_SPEED_M_S if world.effects else STRAY_SPEED_M_S
     limit = 0.0
-    for index in world.free:
+    for index in world.tracked:
         fall = float(world.gravity[0].norm() * _diameter(world, index))
         limit += float(world.bodies[index].mass[0]) * (ABSURD_GAIN * fall + 0.5 * speed**2)
     if not (math.isfinite(gain) and gain <= limit):

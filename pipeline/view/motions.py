@@ -15,8 +15,10 @@ from ...datasets.rollouts.loader import RolloutReader
 from ...datasets.rollouts.rollouts import ContactTable
 from ...schemas import SamplingPlan, SynthesizeConfig
 from ..synthesize.draw import draw_rollout
+from ..synthesize.labels import joint_table
 from ..synthesize.plan import resolve_plan
 from ..synthesize.simulator import Diverged, Simulator
+from ..synthesize.wholes import JointedStart, middle, put_links
 
 Array = NDArray[np.float64]
 Contacts = Mapping[str, NDArray[np.generic]]
@@ -39,6 +41,8 @@ class Motion:
     """Cameras of its pictures, by name."""
     image: Callable[[str, int], NDArray[np.uint8]] | None = None
     """Function that returns the picture of a camera at a frame, uint8 RGB (H, W, 3); None without cameras."""
+    joints: Mapping[str, Array] = field(default_factory=dict)
+    """Values of the joints that move [rad or m], shape (T,), by name."""
 
     @property
     def largest_impulse_n_s(self) -> float:
@@ -57,25 +61,41 @@ def recorded_motion(reader: RolloutReader, number: int) -> Motion:
         contacts=tuple(reader.contacts(number, frame) for frame in range(frames)),
         cameras={name: reader.camera(number, name) for name in reader.cameras(number)},
         image=lambda name, frame: reader.read(number, f"obs/{name}_image", frame, frame + 1)[0],
+        joints=_recorded_joints(reader, number),
     )
 
 
+def _recorded_joints(reader: RolloutReader, number: int) -> dict[str, Array]:
+    if "joints" not in reader.group(number):
+        return {}
+    names, values = reader.read(number, "joints/names"), reader.read(number, "joints/pos")
+    return {name.decode("utf-8", "replace"): values[:, k] for k, name in enumerate(names.tolist())}
+
+
 def still(model: Model) -> Motion:
-    """Return the model with its bodies as in the photos: one frame, no contacts."""
+    """Return the model with its bodies as in the photos, joints in the middle of their limits or at 0: one frame."""
     poses = [body.photo_pose for body in model.file.bodies]
+    position = np.array([pose.position_m for pose in poses], np.float64)
+    quat = np.array([pose.quat_wxyz for pose in poses], np.float64)
+    joints = [JointedStart.of(one, middle) for one in model.file.articulations]
+    put_links(
+        (position, quat, np.zeros_like(position), np.zeros_like(position)), [b.name for b in model.file.bodies], joints
+    )
     return Motion(
         times_s=np.zeros(1),
-        position_m=np.array([[pose.position_m for pose in poses]], np.float64),
-        quat_wxyz=np.array([[pose.quat_wxyz for pose in poses]], np.float64),
+        position_m=position[None],
+        quat_wxyz=quat[None],
         contacts=(_no_contacts(),),
+        joints={name: one.values[k : k + 1] for one in joints for k, name in enumerate(one.chain.joint_names)},
     )
 
 
 def can_move(model: Model) -> bool:
-    """Return whether a model can be simulated: it has fitted contacts, collision spheres and a free body."""
+    """Return whether a model can be simulated: it has fitted contacts, collision spheres and what physics moves."""
     bodies = model.file.bodies
     spheres = all(body.name in model.collision for body in bodies)
-    return model.file.contact is not None and spheres and any(body.motion == "free" for body in bodies)
+    driven = any(one.base == "driven" for one in model.file.articulations)
+    return model.file.contact is not None and spheres and bool(model.file.tracked) and not driven
 
 
 def own_motion(model: Model, number: int) -> Motion:
@@ -94,8 +114,14 @@ def own_motion(model: Model, number: int) -> Motion:
     (found,) = Simulator(model, times_s, "cpu").run([drawn], config.seed)
     if isinstance(found, Diverged):
         raise found.error
+    poses = (found.position_m, found.quat_wxyz, found.velocity_m_s, found.omega_body_rad_s)
+    table = joint_table(model.file, poses)
     return Motion(
-        times_s=times_s, position_m=found.position_m, quat_wxyz=found.quat_wxyz, contacts=_by_frame(found.contacts)
+        times_s=times_s,
+        position_m=found.position_m,
+        quat_wxyz=found.quat_wxyz,
+        contacts=_by_frame(found.contacts),
+        joints={} if table is None else dict(zip(table.names, table.values.T, strict=True)),
     )
 
 

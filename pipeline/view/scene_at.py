@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -69,6 +70,8 @@ class SceneAt:
     """Points and arrows of the contacts."""
     largest_impulse_n_s: float
     """Largest impulse of a contact at this moment [N s]; 0 without contacts."""
+    joints: Mapping[str, float] = field(default_factory=dict)
+    """Values of the joints that move [rad or m], by name."""
 
 
 def shapes_of(model: Model) -> list[BodyShape]:
@@ -97,7 +100,7 @@ def background_from(model: Model, eye_m: Array) -> Splats | None:
 
 def radius_m(model: Model, shapes: list[BodyShape]) -> float:
     """Return the radius of the largest free body [m], which sets the size of the marks."""
-    free = {body.name for body in model.file.bodies if body.motion == "free"}
+    free = set(model.file.tracked)
     reaches = []
     for shape in (shape for shape in shapes if shape.name in free):
         centers = shape.centers_m if shape.splats is None else np.asarray(shape.splats.means, np.float64)
@@ -117,6 +120,7 @@ def scene_at(motion: Motion, frame: int, size_m: float) -> SceneAt:
         quat_wxyz=motion.quat_wxyz[frame],
         marks=contact_marks(contacts, scale),
         largest_impulse_n_s=float(sizes.max(initial=0.0)),
+        joints={name: float(values[frame]) for name, values in motion.joints.items()},
     )
 
 
@@ -126,7 +130,7 @@ def viewpoint(model: Model, motion: Motion, size_m: float) -> tuple[Array, Array
     The eye point is between the cameras and slightly farther away than they are, or, without cameras, above the motion.
     """
     up = up_direction(model.file)
-    moving = [k for k, body in enumerate(model.file.bodies) if body.motion == "free"] or slice(None)
+    moving = [k for k, body in enumerate(model.file.bodies) if body.name in model.file.tracked] or slice(None)
     paths = motion.position_m[:, moving].reshape(-1, 3)
     target = 0.5 * (paths.min(0) + paths.max(0))
     if motion.cameras:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from ...datasets.capture.cameras import Camera
 from ...datasets.shapes.meshes import Mesh
 from ...datasets.shapes.ply import Splats
+from ...schemas.articulations import JointModel
 from ...schemas.surfaces import Surface
 from ..rendering.contact_glyphs import ContactMarks
 from .scene_at import BodyShape
@@ -26,6 +27,7 @@ half-precision floats, whose maximum is 65504."""
 _POINT_RADIUS = 0.1
 """Radius of a contact point [radii of the largest free body]."""
 _SPHERE_RGB = (120, 190, 120)
+_JOINT_RGB = {"hinge": (214, 120, 40), "slide": (60, 110, 200)}
 _SURFACE_RGB, _SURFACE_OPACITY = (150, 160, 175), 0.45
 
 
@@ -65,6 +67,20 @@ def add_surface(scene: Any, surface: Surface, mesh: Mesh | None, size_m: float) 
         flat_shading=True,
         side="double",
         **place,
+    )
+
+
+def add_joint(scene: Any, name: str, joint: JointModel, size_m: float) -> Any:
+    """Add the axis of a joint through the origin of the link that it carries, the parent node; return its handle."""
+    axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
+    ends = np.stack([-0.5 * axis, axis]) * size_m
+    return scene.add_arrows(
+        name,
+        ends[None].astype(np.float32),
+        np.array([_JOINT_RGB[joint.kind]], np.uint8),
+        shaft_radius=0.03 * size_m,
+        head_radius=0.07 * size_m,
+        head_length=0.15 * size_m,
     )
 
 

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 from ...datasets.io.kinds import kind_of
-from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import read_model
 from ...datasets.rollouts.dataset import read_manifest
 from ...datasets.rollouts.loader import RolloutReader
@@ -53,7 +52,6 @@ def _dataset(path: Path, host: str, port: int) -> Viewer:
 
 def _model(path: Path, host: str, port: int) -> Viewer:
     model = read_model(path)
-    refuse_joints(model.file.articulations, str(path), "view")
     motions: dict[str, Callable[[], Motion]] = {"as in the photos": partial(still, model)}
     if can_move(model):
         motions |= {f"rollout {number}": partial(own_motion, model, number) for number in range(OWN_MOTIONS)}

@@ -22,6 +22,7 @@ from .motions import Motion
 from .scene_at import SceneAt, background_from, radius_m, scene_at, shapes_of, viewpoint
 from .scene_nodes import (
     add_camera,
+    add_joint,
     add_marks,
     add_spheres,
     add_splats,
@@ -155,6 +156,10 @@ class Viewer:
             for k, shape in enumerate(self._shapes)
         ]
         self._spheres = [add_spheres(scene, f"/bodies/{k}/spheres", shape) for k, shape in enumerate(self._shapes)]
+        bodies = [body.name for body in model.file.bodies]
+        moving = [joint for one in model.file.articulations for joint in one.joints if joint.kind != "fixed"]
+        self._kinds = {joint.name: joint.kind for joint in moving}
+        self._joints = [add_joint(scene, f"/bodies/{bodies.index(joint.link)}/joint", joint, size) for joint in moving]
         self._cameras: dict[str, Any] = {}
         self._marks: list[Any] = []
 
@@ -193,7 +198,7 @@ class Viewer:
             if self._motion.image is not None and self._frusta.value:
                 for name, handle in self._cameras.items():
                     handle.image = self._motion.image(name, frame)
-            self._status.content = _words(now, frame, len(self._motion.times_s))
+            self._status.content = _words(now, frame, len(self._motion.times_s), self._kinds)
 
     # Controls
 
@@ -216,11 +221,12 @@ class Viewer:
             self._colliding = gui.add_checkbox("collision spheres", not seen)
             self._axes = gui.add_checkbox("body frames", False)
             self._frusta = gui.add_checkbox("cameras", True)
+            self._jointed = gui.add_checkbox("joints", True, visible=bool(self._joints))
         self._arrow_note = gui.add_html("")
         self._frame.on_update(lambda _: self._guarded(lambda: self._show(self._frame.value)))
         self._choice.on_update(lambda _: self._guarded(lambda: self._begin(self._load(self._choice.value))))
         self._play.on_click(lambda _: self._toggle())
-        for box in (self._contacts, self._looks, self._colliding, self._axes, self._frusta):
+        for box in (self._contacts, self._looks, self._colliding, self._axes, self._frusta, self._jointed):
             box.on_update(lambda _: self._guarded(self._refresh))
         self._through.on_update(lambda _: self._guarded(self._make_see_through))
 
@@ -264,6 +270,8 @@ class Viewer:
             handle.show_axes = self._axes.value
         for handle in self._cameras.values():
             handle.visible = self._frusta.value
+        for handle in self._joints:
+            handle.visible = self._jointed.value
 
     def _make_see_through(self) -> None:
         share = _SEE_THROUGH if self._through.value else 1.0
@@ -301,13 +309,19 @@ def _free_port(host: str, port: int) -> int:
         return int(trial.getsockname()[1])
 
 
-def _words(now: SceneAt, frame: int, count: int) -> str:
+def _words(now: SceneAt, frame: int, count: int, kinds: Mapping[str, str]) -> str:
     sliding = int(now.marks.sliding.sum())
     parts = [f"{len(now.marks) - sliding} sticking"] * (len(now.marks) > sliding) + [f"{sliding} sliding"] * (
         sliding > 0
     )
     contacts = f"contacts: {', '.join(parts)}; largest impulse {now.largest_impulse_n_s:.2g} N s" if parts else ""
-    return f"**{now.time_s:.3f} s**, frame {frame + 1} of {count}\n\n{contacts or 'no contact'}"
+    values = [_joint_words(name, value, kinds.get(name, "hinge")) for name, value in now.joints.items()]
+    joints = f"\n\njoints: {', '.join(values)}" if values else ""
+    return f"**{now.time_s:.3f} s**, frame {frame + 1} of {count}\n\n{contacts or 'no contact'}{joints}"
+
+
+def _joint_words(name: str, value: float, kind: str) -> str:
+    return f"{name} {math.degrees(value):.1f} deg" if kind == "hinge" else f"{name} {1e3 * value:.1f} mm"
 
 
 def _legend(largest_n_s: float) -> str:

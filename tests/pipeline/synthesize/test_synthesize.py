@@ -343,7 +343,7 @@ def test_two_bodies_start_apart() -> None:
     for seed in range(10):
         start = draw_start(both, plan, 1.0, np.random.default_rng(seed))
         assert np.linalg.norm(start.position_m[0] - start.position_m[1]) > 2 * extent(both, twin).radius_m
-    with pytest.raises(NotConvergedError, match=r"no start without overlap in 200 draws for 2 free bodies"):
+    with pytest.raises(NotConvergedError, match=r"no start without overlap in 1000 draws for 2 free bodies"):
         draw_start(both, resolve_plan(both, SamplingPlan(offset_m=0.0, height_m=(0, 0))), 1.0, np.random.default_rng(0))
 
 
