@@ -13,9 +13,9 @@ from functools import cached_property, partial
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from ..geometry.rotation import cross
+from ..optimization.forward_mode import parts_of
 from .fixed_surface import HALF_SPACE
 from .hull import MOST_PLANES, Hull, hull_distance, parallel_face, parting
 from .smooth_distance import blended, log_sum_exp_distance, smooth_min
@@ -342,7 +342,7 @@ def _lowest(depth: Tensor, limit: float) -> Tensor | None:
 
 def plain(value: Tensor) -> Tensor:
     """Return a tensor without its derivatives, forward or backward."""
-    return forward_ad.unpack_dual(value).primal.detach()
+    return parts_of(value)[0].detach()
 
 
 def pick(values: Tensor, chosen: Tensor | None) -> Tensor:

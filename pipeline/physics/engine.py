@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
+from ..optimization.forward_mode import parts_of
 from ..runtime.kernel_build import compiler
 from .chain import Joint
 from .contact_detection import pairs_of, slot_count
@@ -131,7 +131,7 @@ def lacking_derivatives(
     tensors = list(_tensors(world, state, times_s, driven))
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return "derivatives in reverse are asked for"
-    if record_contacts and any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors):
+    if record_contacts and any(parts_of(tensor)[1] is not None for tensor in tensors):
         return "derivatives of the contact record are asked for"
     return None
 

@@ -26,6 +26,7 @@ COMPILER = shutil.which("g++")
 SHIM = r"""
 #include <cmath>
 #include <cstdio>
+#include <csetjmp>
 #include <cstdlib>
 #include <ucontext.h>
 #define __device__
@@ -33,6 +34,8 @@ SHIM = r"""
 
 struct Fibres {  // the threads of a warp
     ucontext_t home, contexts[32];
+    jmp_buf places_left[32];
+    bool begun[32];
     double slots[2][32];
     const void* places[2][32];
     long exchanges[32];
@@ -44,7 +47,10 @@ static Fibres fibres;
 static void next_fibre() {
     int from = fibres.current;
     fibres.current = (from + 1) % fibres.count;
-    swapcontext(&fibres.contexts[from], &fibres.contexts[fibres.current]);
+    if (_setjmp(fibres.places_left[from])) return;
+    if (fibres.begun[fibres.current]) _longjmp(fibres.places_left[fibres.current], 1);
+    fibres.begun[fibres.current] = true;
+    setcontext(&fibres.contexts[fibres.current]);  // asks the system for its signals, which a jump does not
 }
 
 static const double* exchange(double mine, const void* place) {
@@ -106,6 +112,7 @@ extern "C" void run(PARAMETERS) {
         for (int lane = 0; lane < fibres.count; lane++) {
             fibres.exchanges[lane] = 0;
             fibres.done[lane] = false;
+            fibres.begun[lane] = lane == 0;
             getcontext(&fibres.contexts[lane]);
             fibres.contexts[lane].uc_stack.ss_sp = stacks[lane];
             fibres.contexts[lane].uc_stack.ss_size = sizeof stacks[lane];
@@ -123,8 +130,8 @@ extern "C" void run(PARAMETERS) {
 
 
 PRODUCT_FLAGS = host.FLAGS
-QUICK_FLAGS = tuple("-O1" if flag == "-O3" else flag for flag in PRODUCT_FLAGS)
-"""Those of the product's kernels in tests: the same arithmetic, built in two thirds of the time."""
+QUICK_FLAGS = tuple("-Og" if flag == "-O3" else flag for flag in PRODUCT_FLAGS)
+"""Those of the product's kernels in tests: the same arithmetic, built in half of the time."""
 
 
 @contextmanager
@@ -143,7 +150,7 @@ WARNINGS += ("-Wno-unused-parameter", "-Wno-unused-variable", "-Wno-array-bounds
 
 
 @cache
-def library(structure: Structure, flags: tuple[str, ...] = ("-O1",)) -> ctypes.CDLL:
+def library(structure: Structure, flags: tuple[str, ...] = ("-Og",)) -> ctypes.CDLL:
     """Return the kernel of a structure, built now or, of the same source and compiler, by an earlier run of tests."""
     assert COMPILER is not None
     source = SHIM + structure.source(host=True) + ENTRY

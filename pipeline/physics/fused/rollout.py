@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from ....schemas import UsageError
 from ...geometry.rotation import quat_conjugate, quat_multiply, quat_rotate
+from ...optimization.forward_mode import dual_of, parts_of
 from ...runtime import kernel_build
 from ..checks import require_physical, require_state
 from ..contact_record import ContactRecord
@@ -53,7 +53,7 @@ def simulate_fused(
 
     A world on the CPU with `World.rolls_on` CUDA is packed on the CPU and copied in one piece.
 
-    Forward derivatives (`forward_ad`, `batched_jacobian`) of poses and velocities are exact: the same program runs on
+    Forward derivatives (`dual_of`, `batched_jacobian`) of poses and velocities are exact: the same program runs on
     dual numbers. The contact record has no derivatives, and reverse derivatives are not supported.
 
     Args:
@@ -113,7 +113,7 @@ def roll(
     pointers += [packed.mesh_numbers, packed.mesh_indices]
     run(structure, (*pointers, frames, frame_tangents, labels, None), (batch, count, world.iterations, *strides))
     if frame_tangents is not None:
-        frames = forward_ad.make_dual(frames, frame_tangents)
+        frames = dual_of(frames, frame_tangents)
     return read_frames(world, times_s, packed, frames, labels)
 
 
@@ -130,9 +130,9 @@ def _values_and_tangents(*inputs: Tensor) -> tuple[list[Tensor], list[Tensor | N
             "forward ones (batched_jacobian), or none (torch.no_grad()).",
             "use simulate for derivatives in reverse.",
         )
-    duals = [forward_ad.unpack_dual(tensor) for tensor in inputs]
-    values = [dual.primal.contiguous() for dual in duals]
-    return values, [None if dual.tangent is None else dual.tangent.contiguous() for dual in duals]
+    duals = [parts_of(tensor) for tensor in inputs]
+    values = [primal.contiguous() for primal, _ in duals]
+    return values, [None if tangent is None else tangent.contiguous() for _, tangent in duals]
 
 
 def require_one_kind(*tensors: Tensor) -> None:
