@@ -39,6 +39,11 @@ def parsed(path: Path) -> ast.Module:
 
 
 @cache
+def nodes(path: Path) -> list[ast.AST]:
+    return list(ast.walk(parsed(path)))
+
+
+@cache
 def import_edges() -> list[import_graph.Import]:
     return import_graph.imports(import_graph.modules())
 
@@ -47,7 +52,7 @@ def imports(path: Path, *, top_level: bool = False) -> Iterator[tuple[int, str]]
     """Yield line and absolute name of all that a file imports; `TYPE_CHECKING` blocks count as well."""
     tree = parsed(path)
     package = module_name(path) if path.name == "__init__.py" else module_name(path).rpartition(".")[0]
-    for node in tree.body if top_level else ast.walk(tree):
+    for node in tree.body if top_level else nodes(path):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -61,7 +66,7 @@ def imports(path: Path, *, top_level: bool = False) -> Iterator[tuple[int, str]]
 @cache
 def calls(path: Path) -> list[tuple[ast.Call, str]]:
     """Return every call in a file with the dotted name of what is called."""
-    return [(node, ast.unparse(node.func)) for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
+    return [(node, ast.unparse(node.func)) for node in nodes(path) if isinstance(node, ast.Call)]
 
 
 def place(path: Path, line: int) -> str:
@@ -107,7 +112,7 @@ def test_the_rooms_import_each_other_relatively() -> None:
     wrong = [
         place(path, node.lineno)
         for path in FILES
-        for node in ast.walk(parsed(path))
+        for node in nodes(path)
         for name in (
             [alias.name for alias in node.names]
             if isinstance(node, ast.Import)

@@ -79,7 +79,8 @@ def _imports_of(name: str, path: Path, known: Mapping[str, Path]) -> Iterator[Im
     typed = {
         id(node)
         for block in ast.walk(tree)
-        if isinstance(block, ast.If) and ast.unparse(block.test).endswith("TYPE_CHECKING")
+        if isinstance(block, ast.If)
+        and "TYPE_CHECKING" in (getattr(block.test, "id", ""), getattr(block.test, "attr", ""))
         for node in ast.walk(block)
     }
     package = ["cgwm", *name.split(".")]

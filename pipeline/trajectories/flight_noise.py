@@ -162,15 +162,13 @@ def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: fl
         for column in range(len(whole.free)):
             if not bool(whole.has_orientation[segment.episode, :, column].any()):
                 continue  # long windows see all of a centroid's errors, see `slow_noise`
-            for frames in _frames(whole, segment, column, kind):
-                if len(frames) < WINDOW:
-                    continue
-                away = _cubic(whole, segment.episode, column, frames, kind)
-                if np.abs(away).max() > LIMITS.keep_sigmas * noise:
-                    continue
-                raw = away * np.sqrt(np.diag(left))[:, None]
-                square, product = square + float((raw**2).sum()), product + float((raw * (pair @ raw)).sum())
-                count += raw.shape[1]
+            frames = _frames(whole, segment, column, kind)
+            if frames.shape[1] < WINDOW:
+                continue
+            away = _cubic(whole, segment.episode, column, frames, kind)
+            raw = away[np.abs(away).max((1, 2)) <= LIMITS.keep_sigmas * noise] * np.sqrt(np.diag(left))[:, None]
+            square, product = square + float((raw**2).sum()), product + float((raw * (pair @ raw)).sum())
+            count += raw.shape[0] * raw.shape[2]
     seen = left @ pair @ left
     alone, known = np.trace(seen), np.trace(left)
     if count == 0 or square <= 0:
@@ -191,10 +189,9 @@ def _residuals(whole: Observations, flight: Sequence[Segment]) -> tuple[np.ndarr
     found = []
     for kind in (0, 1):
         parts = [
-            _cubic(whole, segment.episode, column, chosen, kind).ravel()
+            _cubic(whole, segment.episode, column, _frames(whole, segment, column, kind), kind).ravel()
             for segment in flight
             for column in range(len(whole.free))
-            for chosen in _frames(whole, segment, column, kind)
         ]
         found.append(np.concatenate(parts) if parts else np.zeros(0))
     return found[0], found[1]
@@ -206,40 +203,44 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int, step: in
     for segment in flight:
         for column in range(len(whole.free)):
             frames = torch.arange(segment.first, segment.last + 1)
-            frames = frames[mask[segment.episode, frames, column] > 0]
-            starts = range(0, max(len(frames) - WINDOW, 0) + 1, step) if len(frames) > DEGREE + 2 else ()
-            for start in starts:
-                chosen = frames[start : start + WINDOW]
-                yield segment, column, chosen.numpy(), _cubic(whole, segment.episode, column, chosen, kind)
+            windows = _split(frames[mask[segment.episode, frames, column] > 0], WINDOW, step)
+            away = _cubic(whole, segment.episode, column, windows, kind)
+            for chosen, residuals in zip(windows.numpy(), away, strict=True):
+                yield segment, column, chosen, residuals
 
 
-def _frames(whole: Observations, segment: Segment, column: int, kind: int) -> list[Tensor]:
-    """Return the frames of half-overlapping windows of a flight: long ones where no orientation was measured."""
+def _split(frames: Tensor, length: int, step: int) -> Tensor:
+    """Return windows (W, n) of frames, each `step` after the one before: one of all that are fewer, none of too few."""
+    if len(frames) <= DEGREE + 2:
+        return frames.new_zeros(0, length)
+    return frames.unfold(0, min(length, len(frames)), step)
+
+
+def _frames(whole: Observations, segment: Segment, column: int, kind: int) -> Tensor:
+    """Return the frames (W, n) of half-overlapping windows of a flight: long ones where no orientation was measured."""
     mask = (whole.seen, whole.has_orientation)[kind]
     frames = torch.arange(segment.first, segment.last + 1)
     frames = frames[mask[segment.episode, frames, column] > 0]
-    if len(frames) <= DEGREE + 2:
-        return []
     length = WINDOW
-    if not bool(whole.has_orientation[segment.episode, :, column].any()):
+    if len(frames) > 1 and not bool(whole.has_orientation[segment.episode, :, column].any()):
         step = float(whole.times_s[segment.episode, frames].diff().median())
         length = max(WINDOW, round(LONG_S / step))
-    return [frames[start : start + length] for start in range(0, max(len(frames) - length, 0) + 1, length // 2)]
+    return _split(frames, length, length // 2)
 
 
 def _positions(whole: Observations, episode: int, column: int, frames: Tensor) -> np.ndarray:
-    """Return the measured coordinates (n, 1 to 3) [m]: those that change anywhere in the episode."""
+    """Return the measured coordinates (..., n, 1 to 3) [m]: those that change anywhere in the episode."""
     measured = whole.position_m[episode, whole.seen[episode, :, column] > 0, column].numpy()
-    return whole.position_m[episode, frames, column].numpy()[:, moves(measured)]
+    return whole.position_m[episode, frames, column].numpy()[..., moves(measured)]
 
 
 def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> np.ndarray:
-    """Return the residuals of a cubic (n, 1 to 3) [m or rad], scaled to equal variance."""
+    """Return the residuals of cubics in windows of frames (..., n), (..., n, 1 to 3) [m or rad], of equal variance."""
     t, values = _values(whole, episode, column, frames, kind)
-    scaled = (t - t.mean()) / (t[-1] - t[0])
-    q, _ = np.linalg.qr(np.vander(scaled, DEGREE + 1))
-    left = 1 - (q * q).sum(1)
-    return (values - q @ (q.T @ values)) / np.sqrt(left.clip(1e-6))[:, None]
+    scaled = (t - t.mean(-1, keepdims=True)) / (t[..., -1:] - t[..., :1])
+    q, _ = np.linalg.qr(np.stack((scaled * scaled * scaled, scaled * scaled, scaled, np.ones_like(t)), -1))
+    left = 1 - (q * q).sum(-1, keepdims=True)
+    return (values - q @ (q.swapaxes(-1, -2) @ values)) / np.sqrt(left.clip(1e-6))
 
 
 def _spread(residuals: np.ndarray, floor: float) -> float | None:
@@ -252,9 +253,10 @@ def _spread(residuals: np.ndarray, floor: float) -> float | None:
 
 
 def _values(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (n) [s] and what is measured then (n, 1 to 3): positions [m], or rotation vectors [rad]."""
+    """Return times (..., n) [s] and what is measured then (..., n, 1 to 3): positions [m] or rotation vectors [rad]."""
     times = whole.times_s[episode, frames]
     if kind == 0:
         return times.numpy(), _positions(whole, episode, column, frames)
     quat = whole.quat_wxyz[episode, frames, column]
-    return times.numpy(), continuous_turns(times, quat, reference=torch.tensor(len(quat) // 2)).numpy()
+    middle = torch.full(frames.shape[:-1], frames.shape[-1] // 2)
+    return times.numpy(), continuous_turns(times, quat, reference=middle).numpy()

@@ -25,6 +25,7 @@ def residual_m(model: Path, capture: Path) -> float:
     return found.median
 
 
+@pytest.mark.evidence
 def test_drag_and_tilt_halve_what_is_left_of_throws_that_the_fit_never_saw(tmp_path: Path) -> None:
     data = shared_data()
     if data is None or not (data / "jugglebot").is_dir():

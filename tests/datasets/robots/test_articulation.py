@@ -155,7 +155,7 @@ def test_servos_are_given_by_joint_name_and_need_limits(tmp_path: Path) -> None:
 
 def test_equal_links_get_equal_spheres_inside_their_geometry(tmp_path: Path) -> None:
     found = read_articulation(written(tmp_path, ARM))
-    spheres = link_spheres(found, 60)
+    spheres = link_spheres(found, 24)
     centers, radii = spheres["tip"]
     np.testing.assert_allclose(centers, 0.0)
     assert radii.tolist() == [0.03] and len(spheres["foot"][1]) == 0

@@ -81,7 +81,7 @@ def test_what_is_not_there_is_told_at_once(dataset: Path, options: dict[str, obj
         RolloutDataset(dataset, **options)  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize(("method", "count"), [("fork", 2), ("spawn", 1)])
+@pytest.mark.parametrize(("method", "count"), [("fork", 2), pytest.param("spawn", 1, marks=pytest.mark.evidence)])
 def test_workers_read_the_same(dataset: Path, method: str, count: int) -> None:
     from torch.utils.data import DataLoader
 

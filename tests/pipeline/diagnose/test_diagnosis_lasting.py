@@ -9,7 +9,7 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose.verdict import find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
-from cgwm.pipeline.physics.effects.registry import BUILT_IN, load_effect
+from cgwm.pipeline.physics.effects.registry import load_effect
 from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.prepare import LIMITS, Prepared, prepare
 from cgwm.pipeline.trajectories.correlated_noise import estimate_noise_model
@@ -17,7 +17,13 @@ from cgwm.pipeline.trajectories.innovations import WHITE, CorrelatedNoise, Noise
 from helpers.diagnosis_data import NOISE, tosses, world_with
 from scipy.signal import savgol_filter
 
-LIBRARY = [Candidate(name, load_effect(name)) for name in BUILT_IN]
+LIBRARY = [
+    Candidate(name, load_effect(name))
+    for name in (
+        "linear_drag", "quadratic_drag", "magnus_lift", "constant_force", "gravity_tilt", "com_offset",
+        "rolling_resistance", "stribeck_friction", "velocity_restitution", "adhesion", "clock_scale",
+    )
+]  # fmt: skip
 Episodes = list[tuple[str, dict[str, Track]]]
 
 

@@ -269,7 +269,7 @@ def test_a_state_is_determined_by_the_residuals_that_it_moves_more() -> None:
     assert moving(other, own) == [1]
 
 
-@pytest.mark.parametrize("drags", [(0.15, 0.6), (0.3, 0.3)])
+@pytest.mark.parametrize("drags", [(0.15, 0.6), pytest.param((0.3, 0.3), marks=pytest.mark.evidence)])
 def test_an_effect_that_each_group_has_of_its_own_is_named_for_groups(drags: tuple[float, float]) -> None:
     rng = np.random.default_rng(4)
     world, episodes = world_with("ball", ground=False), []
@@ -288,6 +288,7 @@ def test_an_effect_that_each_group_has_of_its_own_is_named_for_groups(drags: tup
             assert np.allclose(mine, c, atol=0.02)
 
 
+@pytest.mark.evidence
 def test_a_drag_beside_a_tilt_of_each_episode_is_named() -> None:
     named = found({"linear_drag": {"c": 0.3}}, tilt_m_s2=0.15, seed=3)
     assert [one.evidence.candidate.spec for one in named.chosen] == ["linear_drag", "gravity_tilt@episode"]

@@ -51,7 +51,8 @@ def photos():
     return mesh_photos
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.evidence)])
+@pytest.mark.evidence
+@pytest.mark.parametrize("seed", [0, 2])
 def test_a_distilled_set_is_near_to_its_solid_on_average(photos, seed):
     mesh: Mesh = photos.built_in(seed).mesh
     size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))

@@ -70,7 +70,7 @@ def test_a_fit_keeps_to_its_budget_improves_and_repeats():
     truth = _spheres()
     views = [_view(truth, angle) for angle in np.linspace(0, 5.5, 8)]
     few = Spheres(*(getattr(_spheres(60, 5), key) for key in ("means", "scales", "opacities", "colors")))
-    settings = {"budget": 90, "degree": 1, "iterations": 300, "spread": 1.6, "seed": 0, "what": "test"}
+    settings = {"budget": 90, "degree": 1, "iterations": 200, "spread": 1.6, "seed": 0, "what": "test"}
     exposures = Exposures(views, False)
     fitted, history = fit_adaptively(few, views, scene_loss(None, exposures), exposures=exposures, **settings)
     assert len(few) < len(fitted) <= 90
@@ -81,7 +81,7 @@ def test_a_fit_keeps_to_its_budget_improves_and_repeats():
         for one in (few, fitted)
     )
     assert after > before + 5
-    settings["iterations"] = 60
+    settings["iterations"] = 30
     one, other = (
         fit_adaptively(few, views, scene_loss(None, exposures), exposures=exposures, **settings)[0] for _ in range(2)
     )

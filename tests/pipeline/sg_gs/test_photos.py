@@ -58,7 +58,7 @@ def test_gains_are_found_up_to_their_mean(views, truth):
     darker = [replace(view, image=view.image * gain) for view, gain in zip(views, gains, strict=True)]
     exposures = Exposures(darker, True)
     start = replace(truth, colors=mean_colors(truth, darker))
-    descend(Trainable(start, Rates(colors=0.03)), darker, scene_loss(None, exposures), 120, 0, "test")
+    descend(Trainable(start, Rates(colors=0.03)), darker, scene_loss(None, exposures), 90, 0, "test")
     wanted = gains / gains.log().mean(0).exp()
     mine = torch.stack([exposures.gain(view) for view in views])
     before, after = wanted.log().abs().mean(), (mine / wanted).log().abs().mean()
@@ -248,7 +248,7 @@ def test_depth_pulls_the_colliding_surface_to_where_it_was_measured(views):
     target = replace(view, cover=cover, depth=torch.full((height, width), 0.3), labels=None)
     trainable = Trainable(start, Rates(means=0.05, log_scales=0.0))
     loss = geometry_loss(0, SIZE_M, 2.0)
-    descend(trainable, [target], loss, 150, 0, "test")
+    descend(trainable, [target], loss, 100, 0, "test")
     spheres = trainable.spheres()
     local = spheres.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     front = (local[:, 2] - 2 * spheres.scales).detach()

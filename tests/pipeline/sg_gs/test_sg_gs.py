@@ -167,6 +167,7 @@ def test_geometry_comes_first_on_request_or_where_maps_are(capture, result, tmp_
     assert with_maps.record["ball"]["joint"] is False
 
 
+@pytest.mark.evidence
 def test_a_budget_makes_spheres_multiply_beside_the_body(capture, result, refined, monkeypatch):
     monkeypatch.setattr(bodies, "refine", lambda *_: refined[0])  # of the same photos, which `result` has compared
     monkeypatch.setattr(mcmc, "REFINED_EVERY", 20)
@@ -181,6 +182,7 @@ def test_a_budget_makes_spheres_multiply_beside_the_body(capture, result, refine
     np.testing.assert_array_equal(adapted.bodies["ball"].visual.means, result.bodies["ball"].visual.means)
 
 
+@pytest.mark.evidence
 def test_psnr_rises(capture, result, quick):
     few = fit_scene(capture, CONFIG.model_copy(update={"iterations": 2}))
     assert result.record["held_out"]["psnr_db"] > few.record["held_out"]["psnr_db"] + 0.5

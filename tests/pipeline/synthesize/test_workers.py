@@ -46,7 +46,13 @@ def test_an_interrupt_ends_the_processes_and_leaves_nothing_unfinished(model: Pa
     out = tmp_path / "out"
     words = ["synthesize", model, "--out", out, "--shards=2", "--workers=2", "--no-preview", "--device=cpu"]
     words += ["--rollouts=400", "--set=synthesize.width=32", "--set=synthesize.height=24"]
-    with Forked(*words) as process:
+
+    def started_as_forks() -> None:
+        """Processes of a command that has loaded the stage: each that is spawned loads it for three seconds."""
+        forks = multiprocessing.get_context("fork")
+        processes.multiprocessing.get_context = {"spawn": forks}.__getitem__  # of that process alone
+
+    with Forked(*words, before=started_as_forks) as process:
         end = time.monotonic() + 120
         while len(list(tmp_path.glob(".out.*.partial-*"))) < 2:
             assert process.poll() is None and time.monotonic() < end, process.printed()

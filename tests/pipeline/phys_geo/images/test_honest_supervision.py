@@ -10,23 +10,20 @@ import pytest
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.fit import ASSUMED_DENSITY_KG_M3, fit
-from cgwm.pipeline.phys_geo.images import pose_search, pose_tracking
-from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.schemas import PhysConfig, SplatConfig
+from helpers.pose_search import search_briefly
 from helpers.small_model import HALF, MASS
 from helpers.tiny_capture import model_of, thrown, with_manifest, with_tracks, write_tiny_capture
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = PhysConfig(supervise="images", device="cpu", step_s=0.003, population=8, generations=2, iterations=1)
-FRAMES = 6
+FRAMES = 4
 
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few steps of the shooting, and poses looked for in two frames: more of them would look at nothing else."""
-    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
-    monkeypatch.setattr(pose_tracking, "KEYFRAMES", 2)
-    monkeypatch.setattr(pose_search, "KEPT", 2)
+    search_briefly(monkeypatch)
 
 
 def told(tmp_path: Path, masks: bool = True) -> Path:

@@ -12,7 +12,7 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.geometry.rotation import geodesic_angle, quat_to_matrix
 from cgwm.pipeline.geometry.spheres import Spheres
-from cgwm.pipeline.phys_geo.images import end_to_end
+from cgwm.pipeline.phys_geo.images import end_to_end, pose_tracking
 from cgwm.pipeline.phys_geo.images.coarse_spheres import coarse_model, merged
 from cgwm.pipeline.phys_geo.images.contact_spheres import ContactSpheres
 from cgwm.pipeline.phys_geo.images.end_to_end import ImageObjective, TrackTerm, refine_end_to_end
@@ -118,7 +118,7 @@ def valued(objective: ImageObjective, shared: torch.Tensor, states: torch.Tensor
     return objective.value(objective.parts(objective.rollout(shared, states)), shared)
 
 
-@pytest.mark.parametrize("with_tracks", [False, True])
+@pytest.mark.parametrize("with_tracks", [pytest.param(False, marks=pytest.mark.evidence), True])
 def test_gradient_is_that_of_differences_through_contact(
     scene: tuple[Model, World, Rollout], with_tracks: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,7 +190,10 @@ def test_window_and_constant_give_the_loss_of_the_whole_picture(scene: tuple[Mod
 
 
 @pytest.mark.parametrize("masks", [True, pytest.param(False, marks=pytest.mark.evidence)])
-def test_poses_are_found_again(scene: tuple[Model, World, Rollout], masks: bool) -> None:
+def test_poses_are_found_again(
+    scene: tuple[Model, World, Rollout], masks: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_tracking, "KEYFRAMES", 2)
     model, _, rollout = scene
     footage = film(model, rollout, masks)
     nothing = torch.zeros(FRAMES, 1, 3), torch.tensor([1.0, 0, 0, 0]).repeat(FRAMES, 1, 1)

@@ -66,7 +66,8 @@ def test_a_body_that_looks_almost_the_same_turned_about_does_not_flip() -> None:
 def test_a_body_that_looks_the_same_turned_about_keeps_one_history_and_the_other_is_told(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(pose_tracking, "KEYFRAMES", 3)
+    monkeypatch.setattr(pose_tracking, "KEYFRAMES", 2)
+    monkeypatch.setattr(pose_tracking, "POLISH_ITERATIONS", 2)
     footage, found, _ = tracked(two_sided(0.0))
     assert turned_between_frames(found) < 60
     assert 0 <= found.rival_nats < RIVAL_NATS

@@ -10,11 +10,9 @@ import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.images import read_rgb, write_image
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.phys_geo.images import pose_search, pose_tracking
 from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
 from cgwm.pipeline.phys_geo.images.video_checks import examine_tracks, examine_videos
 from cgwm.pipeline.phys_geo.images.video_frames import Footage, load_footage
-from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate, FitRecord, PhysicsFit, physics_fit
 from cgwm.pipeline.physics.effects.effect import ActiveEffect
 from cgwm.pipeline.physics.effects.registry import load_effect
@@ -32,6 +30,7 @@ from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import InputDataError, read_json
 from cgwm.schemas.model import FitFile, ModelFile
 from helpers.commands import cgwm
+from helpers.pose_search import search_briefly
 from helpers.tiny_capture import (
     CAMERAS,
     EPISODE,
@@ -147,9 +146,7 @@ def test_empty_masks_count_as_not_seen(root: Path, monkeypatch: pytest.MonkeyPat
     footage = load_footage(Capture.open(root), EPISODE, 64)
     assert footage.frame_at.tolist() == [[0, 1, 2, 3, -1, 6, 7, 8, 9], [0, 1, 2, 3, 4, 6, 7, 8, -1]]
     assert np.allclose(footage.times_s * RATE_HZ, [0, 1, 2, 3, 4, 6, 7, 8, 9])
-    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
-    monkeypatch.setattr(pose_tracking, "KEYFRAMES", 2)
-    monkeypatch.setattr(pose_search, "KEPT", 2)
+    search_briefly(monkeypatch)
     code, said, out = fit(root)
     assert code == 0, said
     warnings = "\n".join(read_json(out / "model.json", ModelFile).warnings)
