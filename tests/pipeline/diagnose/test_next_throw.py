@@ -340,7 +340,7 @@ def test_a_law_found_is_saved_and_fitted(tmp_path: Path) -> None:
             "--set",
             "phys-geo.population=8",
             "--set",
-            "phys-geo.generations=1",
+            "phys-geo.generations=2",
             "--set",
             "phys-geo.step_s=0.002",
         ],
