@@ -37,19 +37,19 @@ class MujocoPlant:
 
     def __init__(self, found: TaskWorld) -> None:
         self._mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs
-        self._found = found
-        self._parts = _parts(found)
-        self._model = self._mujoco.MjModel.from_xml_string(scene_mjcf(found, self._parts))
+        self.found = found
+        self.parts = _parts(found)
+        self._model = self._mujoco.MjModel.from_xml_string(scene_mjcf(found, self.parts))
         self._data = self._mujoco.MjData(self._model)
 
     def reset(self, position_m: Array, turn_rad: float, finger_m: Array) -> Truth:
         """See :class:`Plant`."""
-        found, data = self._found, self._data
+        found, data = self.found, self._data
         reference = found.goal.reference_wxyz
         quat = quat_multiply(turned(turn_rad, reference), reference).numpy()
         rotation = np.empty(9)
         self._mujoco.mju_quat2Mat(rotation, quat)
-        corners = np.concatenate([part.vertices for part in self._parts]) @ rotation.reshape(3, 3).T
+        corners = np.concatenate([part.vertices for part in self.parts]) @ rotation.reshape(3, 3).T
         self._mujoco.mj_resetData(self._model, data)
         data.qpos[:7] = [*position_m, ground_z(found.world) - corners[:, 2].min(), *quat]
         data.qpos[7:9] = data.ctrl[:] = finger_m

@@ -105,14 +105,27 @@ class PushObjective:
     def residuals(self, values: Tensor, draws: Tensor) -> Tensor:
         """See :class:`Objective`."""
         found = self.predicted(values, draws)
-        index, costs = self.task_world.object, self.task.costs
-        errors = self.task_world.goal.errors(found.position_m[:, 1:, index], found.quat_wxyz[:, 1:, index])
+        index, finger = self.task_world.object, self.task_world.finger
+        object_m, quat = found.position_m[:, 1:, index], found.quat_wxyz[:, 1:, index]
+        return self.rows(object_m, quat, found.position_m[:, 1:, finger, :2], values)
+
+    def rows(self, object_m: Tensor, quat_wxyz: Tensor, finger_m: Tensor, values: Tensor) -> Tensor:
+        """Return the residuals (b, R) of motions at the ends of all pieces.
+
+        Args:
+            object_m: Position of the object [m], shape (b, L + N, 3).
+            quat_wxyz: Its orientation, shape (b, L + N, 4).
+            finger_m: x and y of the finger [m], shape (b, L + N, 2).
+            values: The speeds [m/s], shape (b, N, 2).
+        """
+        costs = self.task.costs
+        errors = self.task_world.goal.errors(object_m, quat_wxyz)
         scales = errors.new_tensor([costs.position_m, costs.position_m, math.radians(costs.turn_deg)])
         lengths = torch.as_tensor(np.diff(self.horizon.times_s))
         weight = costs.path * lengths / lengths.sum()
         weight[-1] += 1.0
         parts = [(errors / scales * weight.sqrt()[:, None]).flatten(1)]
-        apart = found.position_m[:, 1:, self.task_world.finger, :2] - found.position_m[:, 1:, index, :2]
+        apart = finger_m - object_m[..., :2]
         parts.append((apart / costs.reach_m * (lengths / lengths.sum()).sqrt()[:, None]).flatten(1))
         share = torch.as_tensor(self.horizon.lengths_s / self.horizon.lengths_s.sum()).sqrt()
         parts.append((values / costs.speed_m_s * share[:, None]).flatten(1))

@@ -43,18 +43,18 @@ class PushProposals:
         centers, radii = outline(where, *pose)
         if not len(radii):
             return np.zeros((0, *self.objective.shape))
-        ways = _Ways(centers, radii, pose[0][:2])
-        places, normals = _places(centers, radii, rng, count)
+        ways = Ways(centers, radii, pose[0][:2])
+        places, normals = outline_places(centers, radii, rng, count)
         swing = rng.normal(0.0, SWING_RAD, len(places))
         lengths = rng.choice(LENGTHS_M, len(places)) * rng.uniform(0.6, 1.4, len(places))
         speeds = self.objective.bound * rng.uniform(*SPEEDS, len(places))
         found = [
-            self._speeds(ways, place, normal, -_turned(normal, angle) * (GAP_M + length), speed)
+            self.speeds(ways, place, normal, -_turned(normal, angle) * (GAP_M + length), speed)
             for place, normal, angle, length, speed in zip(places, normals, swing, lengths, speeds, strict=True)
         ]
         return np.array(found).reshape(-1, *self.objective.shape)
 
-    def _speeds(self, ways: _Ways, place: Array, normal: Array, push: Array, speed: float) -> Array:
+    def speeds(self, ways: Ways, place: Array, normal: Array, push: Array, speed: float) -> Array:
         """Return the speeds (N, 2) of a way to a place and a push from there."""
         objective = self.objective
         horizon = objective.horizon
@@ -73,7 +73,7 @@ class PushProposals:
 
 
 @dataclass(frozen=True)
-class _Ways:
+class Ways:
     """Ways around discs."""
 
     centers: Array
@@ -100,7 +100,7 @@ class _Ways:
         return bool((np.linalg.norm(nearest - self.centers, axis=1) > self.radii + SAFE_M).all())
 
 
-def _places(centers: Array, radii: Array, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+def outline_places(centers: Array, radii: Array, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
     """Return up to `count` random places (n, 2) of the outline of discs, and its outward normals (n, 2)."""
     chosen = rng.integers(len(radii), size=8 * count)
     normals = _direction(rng.uniform(-math.pi, math.pi, 8 * count))
