@@ -47,6 +47,7 @@ from cgwm.pipeline.control.wording import wilson
 from cgwm.pipeline.geometry.mesh import mesh_volume
 from cgwm.pipeline.sg_gs.collision_spheres import distil
 from cgwm.schemas import (
+    JOINTS,
     BodyModel,
     ContactParameters,
     ControlTask,
@@ -338,7 +339,7 @@ def equal_samples(controller: InMujoco, one: Scene, solver: Callable[[int], Any]
         position, quat = of.task_world.pose(place, turn)
         taken = []
         for number in range(12):
-            joints = dict(zip(("x", "y"), map(float, finger), strict=True))
+            joints = dict(zip(JOINTS, map(float, finger), strict=True))
             state = ControlState(time_s=number / 30, joints=joints, position_m=position, quat_wxyz=quat)
             plan = of.plan(state)
             taken.append(plan.cpu_s if plan else math.inf)

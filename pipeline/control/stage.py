@@ -40,9 +40,13 @@ from .mujoco_plant import MujocoPlant
 from .page import PAGE, PageRun, control_html
 from .plant import ModelPlant, Plant, start_of
 from .tables import figures_of, tables_of
+from .task_world import task_world
 from .wording import advice, sentence, wilson
+from .work import control_budget
 
 DOCUMENT, RECORDING, FILM = "control.json", "run.h5", "run.webm"
+MOST_DRAWS = 1000
+"""Largest number of draws: each is a world of its own."""
 TRIALS = 7
 """Plans that are timed before a run with the real clock; the first ones compile and are not counted."""
 SLOWEST = 2.0
@@ -118,8 +122,8 @@ def control(
     out = Path(out)
     if seeds < 1:
         raise UsageError(f"--seeds {seeds}.", "1 or more.")
-    if draws < 0:
-        raise UsageError(f"--draws {draws}.", "0 or more.")
+    if not 0 <= draws <= MOST_DRAWS:
+        raise UsageError(f"--draws {draws}.", f"0 to {MOST_DRAWS}.")
     clean_stale(out)
     finished = (out / DOCUMENT).is_file()
     if not (finished and resume):
@@ -136,20 +140,23 @@ def control(
     made_of = {**request.inputs(), **request.settings, "versions": json.dumps(versions())}
     if finished and resume and (kept := _kept(out, request)) is not None:
         note(f"control: {out} is already the result of this command")
+        Checkpoint.remove_of(out, made_of)  # which a process left that was killed at its very end
         return kept
     refuse_output(out, "run", overwrite)
-    controller = Controller(request.model, request.task, solver, draws=draws, device=request.device)
-    plant = _plant(controller)
-    for seed in range(seeds):
-        plant.reset(*start_of(controller.task_world, seed))  # refuses what begins inside of something else
-    if clock == "real":
-        _require_speed(controller, plant)
-    checkpoint = Checkpoint.beside(out, made_of, resume, overwrite, "a run")
-    try:
-        runs = [_run(controller, plant, seed, clock, checkpoint) for seed in range(seeds)]
-        result = _write(out, request, controller, runs, (str(model), str(task)), overwrite)
-    except KeyboardInterrupt:
-        raise InterruptedWork(f"{checkpoint.path} holds the runs that ended; --resume goes on with them.") from None
+    planning = task_world(request.model, request.task).planning()
+    with control_budget(planning, request.task, seeds, draws, out):
+        controller = Controller(request.model, request.task, solver, draws=draws, device=request.device)
+        plant = _plant(controller)
+        for seed in range(seeds):
+            plant.reset(*start_of(controller.task_world, seed))  # refuses what begins inside of something else
+        if clock == "real":
+            _require_speed(controller, plant)
+        checkpoint = Checkpoint.beside(out, made_of, resume, overwrite, "a run")
+        try:
+            runs = [_run(controller, plant, seed, clock, checkpoint) for seed in range(seeds)]
+            result = _write(out, request, controller, runs, (str(model), str(task)), overwrite)
+        except KeyboardInterrupt:
+            raise InterruptedWork(f"{checkpoint.path} holds the runs that ended; --resume goes on with them.") from None
     checkpoint.remove()
     return result
 

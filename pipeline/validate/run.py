@@ -42,13 +42,13 @@ def validate_run(path: Path) -> ValidationReport:
     outside = [name for name in names if real_path(path / name).parent != real_path(path)]
     if outside:
         raise InputDataError(f"{document}: '{outside[0]}' lies outside of the run.", "names in its directory.")
-    faults = [f"the file {name} is missing." for name in names if not (path / name).is_file()]
+    faults = [f"control.json names {name}, which is missing." for name in names if not (path / name).is_file()]
     if (path / file.recording).is_file():
         if sha256(path / file.recording) != file.recording_sha256:
             faults.append(f"{file.recording} has another content than when it was written (SHA-256).")
         faults += _recording_faults(path / file.recording, file, document)
     if file.successes != sum(run.ended == "success" for run in file.runs):
-        faults.append(f"successes is {file.successes}, which is not the number of successful runs.")
+        faults.append(f"control.json: successes is {file.successes}, which is not the number of successful runs.")
     facts = {
         "object": file.object,
         "runs": len(file.runs),

@@ -86,6 +86,7 @@ OPTIONS = {
     "eval": ("--split", "--warmup-s", "--trust-effects"),
     "compare": ("--split", "--warmup-s"),
     "diagnose": ("--split", "--candidates", "--throws", "--trust-effects"),
+    "control": ("--seeds", "--draws", "--solver", "--clock", "--device"),
     "improve": ("--split", "--steps", "--from", "--candidates", "--throws", "--config", "--seed"),
     "export": ("--split", "--cameras", "--every", "--task", "--rollout", "--mask", "--sh-degree", "--duration"),
     "import": ("--train", "--test", "--seed", "--only", "--columns", "--length-unit", "--time-unit", "--body"),

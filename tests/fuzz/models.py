@@ -49,6 +49,23 @@ def custom(root: Path) -> None:
     shutil.rmtree(root / "other")
 
 
+def task(root: Path) -> None:
+    """Write a model, and a task with plans so short that runs of it take a second."""
+    from cgwm.schemas import task_toml
+    from helpers.pushing import push_task
+
+    model(root)
+    (root / "task.toml").write_text(task_toml(push_task(success={"timeout_s": 0.1})), encoding="utf-8")
+
+
+def run(root: Path) -> None:
+    """Write runs of a task."""
+    from cgwm.pipeline.control import control
+
+    task(root)
+    control(root / "model", root / "task.toml", root / "run", clock="ideal", seeds=2)
+
+
 def dataset(root: Path) -> None:
     """Write a dataset of two rollouts with images."""
     synthesize_small(root, small=False)

@@ -19,7 +19,7 @@ from .captures import (
     with_transforms,
     write_toss_capture,
 )
-from .models import bare, custom, dataset, merged, model, plan
+from .models import bare, custom, dataset, merged, model, plan, run, task
 from .recordings import (
     balldrops,
     bodies_csv,
@@ -189,6 +189,15 @@ SUBJECTS = {
             ("plan.toml",),
             1.5,
         ),
+        Subject(
+            "task",
+            "tasks",
+            task,
+            (command("control model task.toml --out OUT --clock ideal", weight=0.5),),
+            ("task.toml",),
+            1.0,
+        ),
+        Subject("run", "runs", run, (command("validate run"),), ("run/*",), 0.7),
         Subject(
             "throws",
             "throws",

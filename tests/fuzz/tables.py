@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from . import accepted, oracle, refused, refused_datasets, refused_models, refused_surfaces
+from . import accepted, oracle, refused, refused_control, refused_datasets, refused_models, refused_surfaces
 from .cases import Trial
 from .client import Seen
 from .edits import Row
@@ -12,7 +12,8 @@ from .edits import Row
 
 def must_refuse() -> list[Row]:
     """Return the lines of what has to be refused."""
-    return [*refused.rows(), *refused_models.rows(), *refused_datasets.rows(), *refused_surfaces.rows()]
+    modules = (refused, refused_models, refused_datasets, refused_surfaces, refused_control)
+    return [row for module in modules for row in module.rows()]
 
 
 def must_accept() -> list[Row]:

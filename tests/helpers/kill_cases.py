@@ -14,6 +14,8 @@ from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
 from cgwm.pipeline.sg_gs import bodies
 from cgwm.pipeline.sg_gs.depth_refinement import Refinement
+from cgwm.schemas import task_toml
+from helpers.pushing import push_task
 from helpers.small_model import write_small_model
 from helpers.thrown_cube import write_capture
 from helpers.tiny_capture import FAST, model_of, thrown, write_tiny_capture
@@ -155,6 +157,14 @@ def _import(folder: Path) -> Command:
     return Command(words=words, out=("out",))
 
 
+def _control(folder: Path) -> Command:
+    write_small_model(folder / "model", visible=False)
+    (folder / "task.toml").write_text(task_toml(push_task()))
+    words = ["control", str(folder / "model"), str(folder / "task.toml"), "--out", str(folder / "out")]
+    words += ["--clock", "ideal", "--seeds", "2"]
+    return Command(words=words, out=("out",), again=("--resume",), check=(["validate", str(folder / "out")],))
+
+
 CASES: dict[str, Callable[[Path], Command]] = {
     "calibrate": _calibrate,
     "calibrate --overwrite": _replacing(_calibrate, "--seed", "5", "--set", "calibrate.max_features=600"),
@@ -171,6 +181,8 @@ CASES: dict[str, Callable[[Path], Command]] = {
     "export mjcf --overwrite": _replacing(_mjcf, "--seed", "5"),
     "import csv": _import,
     "improve": _improve,
+    "control": _control,
+    "control --overwrite": _replacing(_control, "--draws", "2"),
     "compare": _page("compare", "--out"),
     "diagnose": _page("diagnose", "--page"),
 }

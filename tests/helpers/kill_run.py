@@ -209,8 +209,9 @@ def _timeless(value: Any) -> Any:
         return [_timeless(part) for part in value]
     if not isinstance(value, dict):
         return value
-    timed = ("fit.json", "calibration.json")  # in a record of hashes
-    return {k: _timeless(v) for k, v in value.items() if not (k.startswith(("seconds", "wall_time")) or k in timed)}
+    timed = ("fit.json", "calibration.json", "control.json")  # in a record of hashes
+    times = ("seconds", "wall_time", "plan_ms", "plan_cpu_ms", "reached_hz")
+    return {k: _timeless(v) for k, v in value.items() if not (k.startswith(times) or k in timed)}
 
 
 @contextlib.contextmanager
