@@ -167,7 +167,16 @@ def distil(solid: Solid, max_spheres: int, first: tuple[Array, Array] | None = N
 def support_of_points(points: Array, directions: Array | None = None) -> Array:
     """Return max n . x over points (n, 3) [m], for each direction, shape (D,)."""
     directions = fibonacci_directions(DIRECTIONS) if directions is None else directions
+    points = points[_outermost(points)]
     return np.array([(points @ direction).max() for direction in directions])
+
+
+def _outermost(points: Array) -> NDArray[np.intp]:
+    """Return the indices of points that are corners of the convex hull: no other is the farthest in a direction."""
+    try:
+        return np.sort(ConvexHull(points).vertices).astype(np.intp)
+    except QhullError:  # fewer than four, or all in one plane
+        return np.arange(len(points))
 
 
 def support_of_spheres(centers: Array, radii: Array, directions: Array | None = None) -> Array:
@@ -214,8 +223,8 @@ class _Chosen:
 def _add_support(chosen: _Chosen, solid: Solid, limit: int, tolerance: float) -> None:
     """Add spheres where the support function is too small, until the error is below `tolerance` [m]."""
     directions = fibonacci_directions(DIRECTIONS)
-    extreme = np.array([int(np.argmax(solid.surface @ direction)) for direction in directions])
-    points = solid.surface[extreme]
+    corners = solid.surface[_outermost(solid.surface)]
+    points = corners[[int(np.argmax(corners @ direction)) for direction in directions]]
     radii = inscribed_radii(solid, points, directions)
     lack = (points * directions).sum(1)
     centers, sizes = chosen.arrays()

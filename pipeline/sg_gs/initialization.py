@@ -265,15 +265,7 @@ def _ground_cover(points: Array, colors: Array, normal: Array, budget: int) -> t
 
 def _quadtree(unit: Array, colors: Array, budget: int) -> Array:
     """Return the leaves (level, column, row) of a greedy quadtree over points in the unit square."""
-    errors: list[dict[tuple[int, int], float]] = []
-    for level in range(_LEVELS):
-        cell = np.minimum((unit * 2**level).astype(np.int64), 2**level - 1)
-        keys, index = np.unique(cell[:, 0] * 2**level + cell[:, 1], return_inverse=True)
-        count = np.bincount(index)
-        sums = np.stack([np.bincount(index, colors[:, k]) for k in range(3)], 1)
-        squares = np.bincount(index, (colors**2).sum(1))
-        error = squares - (sums**2).sum(1) / count
-        errors.append({divmod(key, 2**level): e for key, e in zip(keys.tolist(), error.tolist(), strict=True)})
+    errors = [_cell_errors(unit, colors, 0)]
     heap = [(-errors[0][(0, 0)], 0, 0, 0)]
     done: list[tuple[int, int, int]] = []
     while heap and len(heap) + len(done) < budget:
@@ -281,10 +273,21 @@ def _quadtree(unit: Array, colors: Array, budget: int) -> Array:
         if level + 1 == _LEVELS:
             done.append((level, column, row))
             continue
+        if level + 1 == len(errors):
+            errors.append(_cell_errors(unit, colors, level + 1))
         for child in ((2 * column + i, 2 * row + j) for i in (0, 1) for j in (0, 1)):
             if child in errors[level + 1]:
                 heapq.heappush(heap, (-errors[level + 1][child], level + 1, *child))
     return np.array([*done, *((level, column, row) for _, level, column, row in heap)][:budget], float)
+
+
+def _cell_errors(unit: Array, colors: Array, level: int) -> dict[tuple[int, int], float]:
+    """Return the sum of squared deviations of the colours in each cell (column, row) of a level of the quadtree."""
+    cell = np.minimum((unit * 2**level).astype(np.int64), 2**level - 1)
+    keys, index = np.unique(cell[:, 0] * 2**level + cell[:, 1], return_inverse=True)
+    sums = np.stack([np.bincount(index, colors[:, k]) for k in range(3)], 1)
+    error = np.bincount(index, (colors**2).sum(1)) - (sums**2).sum(1) / np.bincount(index)
+    return {divmod(key, 2**level): e for key, e in zip(keys.tolist(), error.tolist(), strict=True)}
 
 
 def _with_neighbour_scales(points: Array, budget: int, rng: np.random.Generator) -> tuple[Array, Array]:
