@@ -25,6 +25,7 @@ _PUBLIC = {
     "NotEnoughSpaceError": ".schemas",
     "PhysConfig": ".schemas",
     "Reach": ".pipeline.control",
+    "Targets": ".pipeline.control",
     "SplatConfig": ".schemas",
     "SynthesizeConfig": ".schemas",
     "UsageError": ".schemas",
@@ -53,6 +54,7 @@ _PUBLIC = {
     "read_model": ".datasets.models",
     "run_demo": ".pipeline.demo",
     "run_mystery": ".pipeline.demo",
+    "run_world": ".pipeline.demo",
     "synthesize": ".pipeline.synthesize",
     "validate": ".pipeline.validate",
 }
@@ -76,10 +78,11 @@ if TYPE_CHECKING:
     from .datasets.models import Model, read_model
     from .pipeline.calibrate import calibrate
     from .pipeline.compare import compare
-    from .pipeline.control import ClosedLoop, Controller, ControlPlan, ControlState, Reach, Velocity, control
+    from .pipeline.control import ClosedLoop, Controller, ControlPlan, ControlState, Reach, Targets, Velocity, control
     from .pipeline.demo import (
         run_demo,
         run_mystery,
+        run_world,
     )
     from .pipeline.diagnose import diagnose
     from .pipeline.evaluate import evaluate
@@ -129,6 +132,7 @@ __all__ = [
     "Reach",
     "SplatConfig",
     "SynthesizeConfig",
+    "Targets",
     "UsageError",
     "Velocity",
     "__version__",
@@ -156,6 +160,7 @@ __all__ = [
     "read_model",
     "run_demo",
     "run_mystery",
+    "run_world",
     "synthesize",
     "validate",
 ]

@@ -72,6 +72,10 @@ class JointModel(FileModel):
     """Dry friction [N m or N]."""
     armature: Coefficient = 0.0
     """Reflected inertia [kg m2 or kg]."""
+    stiffness: Coefficient = 0.0
+    """Gain of the servo [N m/rad or N/m]; 0: a passive joint."""
+    torque_limit: Annotated[float, Field(gt=0, le=1e9)] | None = None
+    """Largest torque or force of the servo [N m or N]; None for none."""
 
     @model_validator(mode="after")
     def _possible(self) -> JointModel:
@@ -99,6 +103,11 @@ class ArticulationModel(FileModel):
     def links(self) -> tuple[str, ...]:
         """Names of the links, the root first."""
         return (self.root, *(joint.link for joint in self.joints))
+
+    @property
+    def servos(self) -> tuple[str, ...]:
+        """Names of the joints that have a servo."""
+        return tuple(joint.name for joint in self.joints if joint.stiffness > 0)
 
     @property
     def moving_links(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ...schemas import Articulation, ArticulationModel, InputDataError
 
 TAKEN_BY = (
-    "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval', 'synthesize', 'view' and 'export --to mjcf' take "
+    "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval', 'synthesize', 'view', 'export' and ClosedLoop take "
     "jointed bodies"
 )
 """What does."""

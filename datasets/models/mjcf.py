@@ -90,6 +90,7 @@ def write_mjcf(
     for one in file.articulations:
         _add_articulation(world, one, model)
     _add_contacts(root, model)
+    _add_servos(root, file)
     for name, camera in (cameras or {}).items():
         _add_camera(world, name, camera)
     if keyframe is not None:
@@ -283,6 +284,16 @@ def _add_articulation(world: ET.Element, one: ArticulationModel, model: Model) -
             low = -FAR if joint.lower is None else joint.lower
             high = FAR if joint.upper is None else joint.upper
             made.set("range", _text((low, high)))
+
+
+def _add_servos(root: ET.Element, file: ModelFile) -> None:
+    """Add a position actuator for each joint with a servo; its damping is that of the joint."""
+    servos = [joint for one in file.articulations for joint in one.joints if joint.stiffness > 0]
+    parent = ET.SubElement(root, "actuator") if servos else root
+    for joint in servos:
+        made = ET.SubElement(parent, "position", name=joint.name, joint=joint.name, kp=_text(joint.stiffness))
+        if joint.torque_limit is not None:
+            made.set("forcerange", _text((-joint.torque_limit, joint.torque_limit)))
 
 
 def _add_body(

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ...datasets.capture.cameras import Camera
-from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import Model
-from ...schemas import InputDataError, NotConvergedError, UsageError
+from ...schemas import InputDataError, NotConvergedError, UsageError, did_you_mean
 from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
+from ..physics.chain import Chain
+from ..physics.chain_state import joints_of
 from ..physics.checks import require_apart
 from ..physics.fused.stepping import FusedStepper
+from ..physics.joint_command import JointCommand
 from ..physics.kinematic import Drive
 from ..physics.stepping import Stepper, TorchStepper
 from ..physics.thin_walls import require_thick_walls
@@ -52,41 +55,60 @@ class Reach:
     """Orientation (body to world), shape (4,); None keeps the present one."""
 
 
-Command = Velocity | Reach
+@dataclass(frozen=True)
+class Targets:
+    """Command of the servos of a jointed body, under its name: their targets at the end of the control interval."""
+
+    values: Mapping[str, float]
+    """Targets by name of the joint [rad or m]; joints that are left out keep theirs."""
+    hold: Literal["linear", "zero"] = "linear"
+    """How a target changes: linearly over the interval, or at once at its beginning."""
+
+
+Command = Velocity | Reach | Targets
 
 
 class ClosedLoop:
     """A fitted model as the environment of a controller.
 
     Args:
-        model: A model with fitted physics and visual spheres.
-        camera: The camera of the frames.
+        model: A model with fitted physics and visual spheres; jointed bodies run on the CPU.
+        camera: The camera of the frames; None for no frames, which have the shape (0, 0, 3) then.
         control_dt_s: Length of a control interval [s]; the physics divides it into sub-steps.
         device: cpu or cuda.
         dtype: Data type of the physics; frames are rendered in single precision.
 
     Raises:
         InputDataError: If the model has no fitted physics or no visual spheres, or cannot be simulated.
-        UsageError: If the interval is not positive, or the CUDA kernels do not support the model.
+        UsageError: If the interval is not positive, the CUDA kernels do not support the model, or the root of a jointed
+            body is driven.
     """
 
     def __init__(
         self,
         model: Model,
-        camera: Camera,
+        camera: Camera | None,
         control_dt_s: float,
         device: str = "cpu",
         dtype: torch.dtype = torch.float64,
     ) -> None:
         if not 0 < control_dt_s < float("inf"):
             raise UsageError(f"a control interval of {control_dt_s:g} s.", "above 0 s.")
-        refuse_joints(model.file.articulations, model.place, "ClosedLoop")
+        driven = next((one for one in model.file.articulations if one.base == "driven"), None)
+        if driven is not None:
+            raise UsageError(
+                f"{model.place}: the root '{driven.root}' of the jointed body '{driven.name}' is driven, and "
+                "ClosedLoop moves driven bodies without joints alone.",
+                'jointed bodies with base = "free" or "fixed".',
+            )
         world = World.from_model(model, dtype, device)
         self._world, self._cuda = world, world.gravity.is_cuda
         self._times = torch.tensor([[0.0, control_dt_s]], dtype=torch.float64)
         stepper: Stepper = (FusedStepper if self._cuda else TorchStepper)(world, control_dt_s)
         self._stepper = stepper
-        self._picture = FrameRenderer(model, camera, device)
+        self._picture = _NoFrames(world) if camera is None else FrameRenderer(model, camera, device)
+        self._servos = [chain for chain in world.chains if JointCommand.needed(chain)]
+        self._targets: dict[str, Tensor] = {}
         self._poses: dict[str, tuple[Tensor, Tensor]] | None = None
         self._steps = 0
         self._graph: _Graph | None = None
@@ -101,7 +123,8 @@ class ClosedLoop:
         """Set the state, and return its frame, uint8 RGB (H, W, 3), on the device.
 
         Args:
-            state: State of all bodies (1, nb, ...); driven and fixed bodies are at rest at the given poses.
+            state: State of all bodies (1, nb, ...); driven and fixed bodies are at rest at the given poses. Servos
+                hold the values that their joints have there.
 
         Raises:
             InputDataError: If the state has another shape, is not finite, or bodies interpenetrate deeply.
@@ -116,7 +139,11 @@ class ClosedLoop:
         pose = (start.position_m.to("cpu", torch.float64), start.quat_wxyz.to("cpu", torch.float64))
         driven = [k for k, body in enumerate(world.bodies) if body.motion == "driven"]
         poses = {self.body_names[k]: (pose[0][:, k], quat_normalize(pose[1][:, k])) for k in driven}
-        at_rest = self._typed(self._commanded(poses, {name: Velocity((0.0, 0.0, 0.0)) for name in poses}))
+        self._targets = {
+            chain.name: joints_of(world, start, chain)[0].to("cpu", torch.float64) for chain in self._servos
+        }
+        still = self._commanded(poses, {name: Velocity((0.0, 0.0, 0.0)) for name in poses})
+        at_rest = {**self._typed(still), **self._servo_commands({})}
         require_apart(world, start)
         require_thick_walls(world, start)
         self._stepper.reset(start, at_rest)
@@ -136,7 +163,8 @@ class ClosedLoop:
         """Advance the environment by one control interval.
 
         Args:
-            command: Command of every driven body, by name.
+            command: Command of every driven body, by name; `Targets` of jointed bodies with servos, which without any
+                hold their last targets.
 
         Returns:
             Frame at the end of the interval, uint8 RGB (H, W, 3), and state there (1, nb, ...). Both are on the device,
@@ -148,8 +176,10 @@ class ClosedLoop:
         """
         if self._poses is None:
             raise UsageError("a step before the first reset.", todo="call reset(state) first.")
-        drives = self._commanded(self._poses, command or {})
-        self._stepper.command(self._typed(drives))
+        given = dict(command or {})
+        joints = {chain.name: given.pop(chain.name) for chain in self._servos if chain.name in given}
+        drives = self._commanded(self._poses, given)
+        self._stepper.command({**self._typed(drives), **self._servo_commands(joints)})
         outcome = self._graph.replayed() if self._graph is not None else self._advanced(None)
         pairs, finite = outcome.checks.tolist()  # waits for the device
         self._steps += 1
@@ -176,7 +206,12 @@ class ClosedLoop:
             raise UsageError(f"{found}.", f"one for each of: {', '.join(poses) or 'no body'}.")
         drives = {}
         for name, (position, quat) in poses.items():
-            velocity, omega = self._velocities(name, command[name], position, quat)
+            wanted = command[name]
+            if isinstance(wanted, Targets):
+                raise UsageError(
+                    f"the command of '{name}' has targets of joints.", "Velocity or Reach of a driven body."
+                )
+            velocity, omega = self._velocities(name, wanted, position, quat)
             drives[name] = Drive.from_velocities(self._times, position, quat, velocity[:, None], omega[:, None])
         return drives
 
@@ -189,7 +224,26 @@ class ClosedLoop:
 
         return {name: Drive(*map(typed, vars(drive).values())) for name, drive in drives.items()}
 
-    def _velocities(self, name: str, command: Command, position: Tensor, quat: Tensor) -> tuple[Tensor, Tensor]:
+    def _servo_commands(self, given: Mapping[str, Command]) -> dict[str, JointCommand]:
+        """Return the commands of the servos over an interval, and keep their targets at its end."""
+        commands = {}
+        for chain in self._servos:
+            before, after = self._targets[chain.name], self._targets[chain.name].clone()
+            wanted = given.get(chain.name, Targets({}))
+            if not isinstance(wanted, Targets):
+                raise UsageError(
+                    f"the command of the jointed body '{chain.name}' is {wanted}.", "Targets of its joints."
+                )
+            for name, value in wanted.values.items():
+                after[0, _joint_of(chain, name)] = _row(name, [value], 1)[0, 0]
+            knots = torch.stack((before, after) if wanted.hold == "linear" else (after, after), 1)
+            commands[chain.name] = JointCommand.targets(self._times, knots.to(self._world.gravity.dtype))
+            self._targets[chain.name] = after
+        return commands
+
+    def _velocities(
+        self, name: str, command: Velocity | Reach, position: Tensor, quat: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return velocity [m/s] and angular velocity [rad/s] of a command, world frame, shape (1, 3)."""
         if isinstance(command, Velocity):
             return _row(name, command.velocity_m_s, 3), _row(name, command.omega_world_rad_s, 3)
@@ -220,6 +274,26 @@ class ClosedLoop:
         with torch.cuda.graph(graph):
             outcome = self._advanced(capacity)
         return _Graph(graph, outcome, capacity)
+
+
+class _NoFrames:
+    """Renderer of nothing, for loops without a camera."""
+
+    def __init__(self, world: World) -> None:
+        self._frame = torch.zeros(0, 0, 3, dtype=torch.uint8, device=world.gravity.device)
+
+    def of(self, state: State, capacity: int | None = None) -> tuple[Tensor, Tensor]:
+        """Return an empty frame, and no pairs."""
+        return self._frame, torch.zeros((), dtype=torch.int32, device=self._frame.device)
+
+
+def _joint_of(chain: Chain, name: str) -> int:
+    """Return the column of a joint with a servo."""
+    known = [joint.name for joint in chain.moving if bool((joint.stiffness > 0).any())]
+    if name not in known:
+        near = did_you_mean(name, known)
+        raise UsageError(f"'{chain.name}' has no joint '{name}' with a servo.", ", ".join(known) + "." + near)
+    return chain.joint_names.index(name)
 
 
 @dataclass(frozen=True)

@@ -217,6 +217,8 @@ def chain_of_model(entry: ArticulationModel, like: Tensor) -> Chain:
             damping=joint.damping,
             friction=joint.friction,
             armature=joint.armature,
+            stiffness=joint.stiffness,
+            torque_limit=math.inf if joint.torque_limit is None else joint.torque_limit,
             like=like,
         )
         for joint in entry.joints

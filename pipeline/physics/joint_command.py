@@ -100,6 +100,11 @@ class JointCommand:
         return value
 
     @staticmethod
+    def needed(chain: Chain) -> bool:
+        """Return whether a joint of a chain has a servo."""
+        return bool(chain.moving) and bool((chain.numbers("stiffness") > 0).any())
+
+    @staticmethod
     def of(chain: Chain, driven: Mapping[str, object], like: Tensor) -> JointCommand | None:
         """Return the command of a chain; None where no joint of it has a servo.
 
@@ -107,7 +112,7 @@ class JointCommand:
             InputDataError: If its servos have no command, or one for another number of joints.
         """
         count = len(chain.moving)
-        if not count or not bool((chain.numbers("stiffness") > 0).any()):
+        if not JointCommand.needed(chain):
             return None
         command = driven.get(chain.name)
         if not isinstance(command, JointCommand):

@@ -12,6 +12,7 @@ import torch
 
 from ...schemas import UsageError
 from .checks import require_physical, require_state
+from .joint_command import JointCommand
 from .kinematic import Drive
 from .rigid_body import Motion
 from .rollout import Engine
@@ -21,19 +22,20 @@ from .world import State, World
 class Stepper(Protocol):
     """Interface for the simulation of one environment by intervals of equal length, with the steps of one rollout."""
 
-    def reset(self, state: State, drives: Mapping[str, Drive]) -> None:
+    def reset(self, state: State, drives: Mapping[str, Drive | JointCommand]) -> None:
         """Start from a state (1, nb, ...).
 
         Args:
             state: Poses and velocities of all bodies; driven ones are at the start of their commands.
-            drives: Command of each driven body over one interval, which begins at time 0.
+            drives: Command of each driven body over one interval, which begins at time 0; of servos under the name of
+                their chain.
 
         Raises:
             InputDataError: If the state is not finite.
         """
         ...
 
-    def command(self, drives: Mapping[str, Drive]) -> None:
+    def command(self, drives: Mapping[str, Drive | JointCommand]) -> None:
         """Set the commands of the driven bodies for the next interval."""
         ...
 
@@ -60,13 +62,13 @@ class TorchStepper:
         self._engine: Engine | None = None
         self._motions: list[Motion] = []
 
-    def reset(self, state: State, drives: Mapping[str, Drive]) -> None:
+    def reset(self, state: State, drives: Mapping[str, Drive | JointCommand]) -> None:
         """See :class:`Stepper`."""
         require_state(state, self._world.body_names)
         self._engine = Engine(self._world, state, self._times, drives)
         self._motions = self._engine.begin(state)
 
-    def command(self, drives: Mapping[str, Drive]) -> None:
+    def command(self, drives: Mapping[str, Drive | JointCommand]) -> None:
         """See :class:`Stepper`."""
         self._motions = self._started().commanded(self._motions, drives)
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from ...datasets.models.model import Model
 from ...datasets.rollouts.rollouts import ContactTable
 from ...schemas import ModelFile, NotConvergedError
+from ..physics.chain_state import joints_of
 from ..physics.checks import require_apart
 from ..physics.contact_record import ContactRecord
 from ..physics.devices import on_device
@@ -26,6 +27,7 @@ from ..physics.effects.effect import changed_by_effects
 from ..physics.engine import rollout as roll_out
 from ..physics.fused import unsupported
 from ..physics.fused.host import lacking
+from ..physics.joint_command import JointCommand
 from ..physics.kinematic import Drive
 from ..physics.rollout import Rollout, require_finite
 from ..physics.thin_walls import require_thick_walls
@@ -118,7 +120,7 @@ class Simulator:
             require_thick_walls(world, _state([draw.start]), name)
         world = joined_worlds([*worlds, *[worlds[-1]] * (size - len(draws))])
         state = _state([draw.start for draw in filled])
-        driven = self._driven(filled)
+        driven = {**self._driven(filled), **self._held(state)}
         there_world, there_state = on_device((world, state), self._device)
         rollout = roll_out(there_world, there_state, self._times, driven, record_contacts=True)
         rollout = on_device(rollout, "cpu")
@@ -132,6 +134,12 @@ class Simulator:
         names = list(draws[0].start.driven)
         like = torch.zeros(1, dtype=torch.float64, device=self._device)
         return {name: Drive.of([draw.start.driven[name] for draw in draws], like) for name in names}
+
+    def _held(self, state: State) -> dict[str, JointCommand]:
+        """Return the commands of servos, which hold the values that their joints have at the start."""
+        chains = [chain for chain in self._world.chains if JointCommand.needed(chain)]
+        held = {chain.name: joints_of(self._world, state, chain)[0].to(self._device) for chain in chains}
+        return {name: JointCommand.hold_still(values) for name, values in held.items()}
 
     def _result(
         self, draw: Draw, file: ModelFile, rollout: Rollout, row: int, began: tuple[World, State], name: str

@@ -12,11 +12,12 @@ from ...datasets.models.effect_files import packed_name
 from ...datasets.models.model import Model
 from ...schemas import CgwmError, InputDataError, ModelFile
 from ..geometry.rotation import quat_to_matrix
-from ..physics.chain_state import with_joints
+from ..physics.chain_state import joints_of, with_joints
 from ..physics.checks import require_apart
 from ..physics.effects.registry import BUILT_IN
 from ..physics.engine import rollout
 from ..physics.fused.host import lacking
+from ..physics.joint_command import JointCommand
 from ..physics.rollout import Rollout, simulate
 from ..physics.thin_walls import thin_wall_warnings
 from ..physics.world import State, World
@@ -136,7 +137,9 @@ def _simulated(world: World, state: State) -> Rollout:
     fused = lacking(world) is None
     steps = max((MOST_SWEEPS if fused else MOST_SWEEPS_TORCH) // world.iterations, FRAMES)
     times = torch.linspace(0.0, min(LENGTH_S, steps * world.step_s), FRAMES, dtype=torch.float64)
-    return (rollout if fused else simulate)(world, state, times)
+    chains = [chain for chain in world.chains if JointCommand.needed(chain)]
+    held = {chain.name: JointCommand.hold_still(joints_of(world, state, chain)[0]) for chain in chains}
+    return (rollout if fused else simulate)(world, state, times, held)
 
 
 def _fault(world: World, state: State, result: Rollout) -> str | None:

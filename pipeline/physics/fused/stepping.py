@@ -11,6 +11,7 @@ from torch import Tensor
 from ....schemas import UsageError
 from ..checks import require_physical, require_state
 from ..effects.effect import changed_by_effects
+from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..world import State, World
 from .launch import launch
@@ -51,8 +52,9 @@ class FusedStepper:
         self._driven = [body.name for body in world.bodies if body.motion == "driven"]
         self._resident: _Resident | None = None
 
-    def reset(self, state: State, drives: Mapping[str, Drive]) -> None:
+    def reset(self, state: State, drives: Mapping[str, Drive | JointCommand]) -> None:
         """See :class:`Stepper`; the state has the device and type of the world, the drives are on the CPU."""
+        drives = _bodies_only(drives)
         like = self._world.gravity
         require_one_kind(like, *vars(state).values())
         require_state(state, self._world.body_names)
@@ -66,8 +68,9 @@ class FusedStepper:
         self._resident.carried[..., : motions.shape[1]] = motions[:, None]
         self.command(drives)
 
-    def command(self, drives: Mapping[str, Drive]) -> None:
+    def command(self, drives: Mapping[str, Drive | JointCommand]) -> None:
         """See :class:`Stepper`; drives lie on the CPU, and the previous interval must have ended."""
+        drives = _bodies_only(drives)
         resident = self._started()
         if self._driven:
             resident.sent.copy_(torch.cat([drive_rows(drives[name], resident.turn)[0] for name in self._driven], 1))
@@ -91,6 +94,11 @@ class FusedStepper:
         if self._resident is None:
             raise UsageError("the stepper has no state yet.", todo="call reset first.")
         return self._resident
+
+
+def _bodies_only(drives: Mapping[str, Drive | JointCommand]) -> dict[str, Drive]:
+    """Return the commands of driven bodies; worlds with joints are refused."""
+    return {name: drive for name, drive in drives.items() if isinstance(drive, Drive)}
 
 
 @dataclass(frozen=True, kw_only=True)

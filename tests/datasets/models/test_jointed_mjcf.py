@@ -88,3 +88,15 @@ def test_a_model_is_written_and_read_and_refused_where_joints_are_not_taken(tmp_
     assert read_model(tmp_path / "model").file == written.file
     with pytest.raises(InputDataError, match=r"M: it has jointed bodies \('arm'\), which view does not take yet"):
         refuse_joints(written.file.articulations, "M", "view")
+
+
+def test_servos_are_position_actuators() -> None:
+    plain = model("fixed")
+    served = JOINTS[0].model_copy(update={"stiffness": 2.5, "torque_limit": 0.4})
+    arm = plain.file.articulations[0].model_copy(update={"joints": (served, *JOINTS[1:])})
+    text = write_mjcf(replace(plain, file=plain.file.model_copy(update={"articulations": (arm,)})))
+    loaded = mujoco.MjModel.from_xml_string(text)
+    assert loaded.nu == 1
+    assert loaded.actuator_gainprm[0, 0] == 2.5 and loaded.actuator_biasprm[0, 1] == -2.5
+    np.testing.assert_array_equal(loaded.actuator_forcerange[0], [-0.4, 0.4])
+    assert mujoco.MjModel.from_xml_string(write_mjcf(plain)).nu == 0

@@ -1,0 +1,102 @@
+"""Closed-loop steps of jointed bodies: servo targets against one open-loop rollout, and what is refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from cgwm.datasets.models.model import Model
+from cgwm.pipeline.control import ClosedLoop, Targets, Velocity
+from cgwm.pipeline.physics.chain_state import joints_of, with_joints
+from cgwm.pipeline.physics.fused.stepping import FusedStepper
+from cgwm.pipeline.physics.joint_command import JointCommand
+from cgwm.pipeline.physics.rollout import simulate
+from cgwm.pipeline.physics.world import State, World
+from cgwm.schemas import UsageError
+from helpers.jointed_model import HEIGHT_M, jointed_model
+
+DT = 0.01
+
+
+def served(base: str = "fixed") -> Model:
+    model = jointed_model(base, (-1.0, 1.0))
+    joint = model.file.articulations[0].joints[0]
+    joint = joint.model_copy(update={"stiffness": 2.0, "damping": 0.05, "armature": 1e-3, "torque_limit": 1.5})
+    entry = model.file.articulations[0].model_copy(update={"joints": (joint,)})
+    return replace(model, file=model.file.model_copy(update={"articulations": (entry,)}))
+
+
+def start(world: World, angle: float) -> State:
+    position = torch.tensor([[[0.0, 0.0, HEIGHT_M]] * 2], dtype=torch.float64)
+    quat = torch.tensor([[[1.0, 0.0, 0.0, 0.0]] * 2], dtype=torch.float64)
+    return with_joints(
+        world, State(position, quat, torch.zeros_like(position), torch.zeros_like(position)), {"elbow": angle}
+    )
+
+
+def test_servo_targets_are_those_of_one_rollout() -> None:
+    model = served()
+    world = World.from_model(model)
+    targets, began = [0.3, -0.2], 0.1
+    loop = ClosedLoop(model, None, DT)
+    frame = loop.reset(start(world, began))
+    assert frame.shape == (0, 0, 3)
+    found = []
+    for target in targets:
+        _, state = loop.step({"arm": Targets({"elbow": target})})
+        found.append(joints_of(world, state, world.chains[0])[0])
+    _, state = loop.step()  # the last target is held
+    found.append(joints_of(world, state, world.chains[0])[0])
+    times = DT * torch.arange(len(targets) + 2, dtype=torch.float64)
+    knots = torch.tensor([began, *targets, targets[-1]], dtype=torch.float64)[None, :, None]
+    command = JointCommand.targets(times[None], knots)
+    whole = simulate(world, start(world, began), times, {"arm": command})
+    for k, values in enumerate(found, 1):
+        there = State(*(getattr(whole, name)[:, k] for name in State.__dataclass_fields__))
+        torch.testing.assert_close(values, joints_of(world, there, world.chains[0])[0], atol=1e-8, rtol=0)
+    assert abs(float(found[-1]) - began) > 0.002
+
+
+def test_a_target_at_once_is_faster_than_a_linear_one() -> None:
+    model = served()
+    world = World.from_model(model)
+    moved = []
+    for hold in ("linear", "zero"):
+        loop = ClosedLoop(model, None, DT)
+        loop.reset(start(world, 0.0))
+        _, state = loop.step({"arm": Targets({"elbow": -0.5}, hold=hold)})
+        moved.append(-float(joints_of(world, state, world.chains[0])[0]))
+    assert moved[1] > moved[0] + 0.001
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ({"arm": Targets({"elbo": 0.1})}, "'arm' has no joint 'elbo' with a servo.*Did you mean 'elbow'"),
+        ({"arm": Targets({"elbow": float("nan")})}, "the command of 'elbow' has"),
+        ({"arm": Velocity((0, 0, 0))}, "the command of the jointed body 'arm' is Velocity"),
+        ({"leg": Targets({"elbow": 0.1})}, "a command for 'leg', which is not driven"),
+    ],
+)
+def test_wrong_commands_are_refused(command: dict, words: str) -> None:
+    model = served()
+    loop = ClosedLoop(model, None, DT)
+    loop.reset(start(World.from_model(model), 0.0))
+    with pytest.raises(UsageError, match=f"(?s){words}"):
+        loop.step(command)
+
+
+def test_passive_joints_have_no_targets_and_driven_roots_are_refused() -> None:
+    model = jointed_model("fixed")
+    loop = ClosedLoop(model, None, DT)
+    loop.reset(start(World.from_model(model), 0.0))
+    _, state = loop.step()
+    assert float(joints_of(World.from_model(model), state, World.from_model(model).chains[0])[0]) > 0.001
+    with pytest.raises(UsageError, match="a command for 'arm', which is not driven"):
+        loop.step({"arm": Targets({"elbow": 0.1})})
+    with pytest.raises(UsageError, match="the root 'upper' of the jointed body 'arm' is driven"):
+        ClosedLoop(served("driven"), None, DT)
+
+
+def test_the_gpu_stepper_says_that_it_takes_no_joints() -> None:
+    with pytest.raises(UsageError, match=r"no place for joints.\n.*step it on the CPU"):
+        FusedStepper(World.from_model(served()), DT, lambda *_: None)
