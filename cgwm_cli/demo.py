@@ -12,7 +12,7 @@ from .options import AnyDevice, Overwrite
 from .verb import verb
 
 if TYPE_CHECKING:
-    from ..schemas import ComparedParameter, DemoResult, DemoTarget, ImagesOnlyFit, MysteryResult
+    from ..schemas import ComparedParameter, DemoResult, DemoTarget, ImagesOnlyFit, MysteryResult, WorldDemoResult
 
 
 @verb
@@ -20,11 +20,12 @@ def demo(
     emit: Emit,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The directory to write.", show_default=False)],
     scene: Annotated[
-        Literal["fall", "push", "mystery"],
+        Literal["fall", "push", "bin", "ramp", "mystery"],
         typer.Option(
             "--scene",
-            help="fall: an object falls and bounces; push: a fingertip pushes an object; mystery: fit, compare and "
-            "diagnose search for an effect that is hidden in the physics or the measurement.",
+            help="fall: an object falls and bounces; push: a fingertip pushes an object; bin: five objects are dropped "
+            "into a tray; ramp: a block slides and a ball rolls down onto a floor of another material; mystery: fit, "
+            "compare and diagnose search for an effect that is hidden in the physics or the measurement.",
         ),
     ] = "fall",
     renderer: Annotated[
@@ -40,6 +41,12 @@ def demo(
             from ..pipeline.demo import run_mystery
 
         emit(run_mystery(out, seed, device, overwrite), lambda result: _story(result, out))
+        return
+    if scene in ("bin", "ramp"):
+        with loading():
+            from ..pipeline.demo import run_world
+
+        emit(run_world(out, scene, seed, device, overwrite), lambda result: _world(result, out))
         return
     with loading():
         from ..pipeline.demo import run_demo
@@ -69,6 +76,22 @@ def _story(result: MysteryResult, out: Path) -> str:
     lines.append(f"hidden    {result.sentence}" + "".join(f" True: {words}." for words in truth))
     lines += [*warnings(result.warnings), f"{sum(result.seconds.values()):.0f} s."]
     return "\n".join([*lines, f"Report: {out / result.paths['report']}"])
+
+
+def _world(result: WorldDemoResult, out: Path) -> str:
+    from .output import millimetres, table, warnings
+
+    rows = [_row(p) for p in result.parameters if p.parameter.state == "fitted"]
+    error = millimetres(result.evaluation.translation_error_m.median)
+    lines = [
+        result.verdict,
+        table(rows, ["parameter", "estimate", "95 % interval", "truth", "unit"]),
+        f"{error} open-loop error on {result.evaluation.episodes} test episodes (median).",
+        f"{sum(result.seconds.values()):.0f} s.",
+        *warnings(result.warnings),
+        f"Report: {out / result.paths['report']}",
+    ]
+    return "\n".join(lines)
 
 
 def _summary(result: DemoResult, out: Path) -> str:

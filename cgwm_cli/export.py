@@ -21,12 +21,13 @@ def export(
     emit: Emit,
     thing: Annotated[Path, typer.Argument(metavar="THING", help="A dataset or a model.", show_default=False)],
     to: Annotated[
-        Literal["lerobot", "bop", "nerfstudio", "mjcf", "ply", "colmap", "glb"],
+        Literal["lerobot", "bop", "nerfstudio", "mjcf", "urdf", "usd", "ply", "colmap", "glb"],
         typer.Option(
             "--to",
             metavar="FORMAT",
             help="For a dataset: lerobot (v3), bop (scenewise), nerfstudio (transforms.json of one rollout). "
-            "For a model: mjcf, ply (3D Gaussian splatting), colmap, glb (KHR_gaussian_splatting).",
+            "For a model: mjcf, urdf, usd (with physics), ply (3D Gaussian splatting), colmap, "
+            "glb (KHR_gaussian_splatting).",
             show_default=False,
         ),
     ],
@@ -36,7 +37,8 @@ def export(
             "--out",
             "-o",
             metavar="PATH",
-            help="The directory to write; for mjcf an .xml, for glb a .glb, for ply a directory or a single .ply.",
+            help="The directory to write; for mjcf an .xml, for usd a .usda, for glb a .glb, for ply a directory or a "
+            "single .ply.",
             show_default=False,
         ),
     ],
@@ -81,7 +83,7 @@ def export(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option("--seed", min=0, help="mjcf: seed of the motion compared with MuJoCo (0).", show_default=False),
+        typer.Option("--seed", min=0, help="mjcf, urdf, usd: seed of what is compared (0).", show_default=False),
     ] = None,
     duration: Annotated[
         float | None,

@@ -139,6 +139,7 @@ from .results import EpisodeErrors, ErrorSummary, EvalResult, KeptOutput
 from .surfaces import Surface
 from .validation import Failure, ValidationReport
 from .view import ViewReport
+from .world_demo import RolloutCheck, WorldDemoResult
 
 __all__ = [
     "CAMERAS_FORMAT",
@@ -265,6 +266,7 @@ __all__ = [
     "Remaining",
     "ResidualLaw",
     "RevealedEffect",
+    "RolloutCheck",
     "SamplingPlan",
     "Scale",
     "SealedFile",
@@ -287,6 +289,7 @@ __all__ = [
     "Video",
     "ViewReport",
     "World",
+    "WorldDemoResult",
     "WorstMoment",
     "did_you_mean",
     "parse",

@@ -32,16 +32,16 @@ _HEAD_BYTES = 1 << 12
 
 DirectoryKind = Literal[
     "model", "dataset", "capture", "demo", "ladder", "run", "LeRobot dataset", "BOP dataset", "nerfstudio capture",
-    "COLMAP model", "splat folder",
+    "COLMAP model", "splat folder", "URDF folder",
 ]  # fmt: skip
 FileKind = Literal[
-    "page", "MJCF file", "glTF file", "splat file", "index", "effect", "effect template", "calibration", "truth",
-    "track file", "manifest",
+    "page", "MJCF file", "USD file", "glTF file", "splat file", "index", "effect", "effect template", "calibration",
+    "truth", "track file", "manifest",
 ]  # fmt: skip
 
 _DIRECTORY_KINDS = frozenset(get_args(DirectoryKind))
 
-_REPEATABLE = frozenset({"MJCF file", "glTF file", "splat file", "effect template", "index"})
+_REPEATABLE = frozenset({"MJCF file", "USD file", "glTF file", "splat file", "effect template", "index"})
 
 _SYSTEM_FILES = re.compile(
     r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini|__pycache__/.*|\..*\.(partial|pending|replaced)-.*)"
@@ -351,6 +351,7 @@ def _is_unchanged(path: Path) -> bool:
 _RECOGNISED: Mapping[str, Callable[[Path], bool]] = {
     "page": _head(b"<!doctype html>", b'<meta name="generator" content="cgwm">'),
     "MJCF file": _is_mjcf,
+    "USD file": _head(b"#usda 1.0", b"Written by cgwm"),
     "glTF file": _head(b"glTF", b'"generator":"cgwm"'),
     "splat file": _head(b"ply\n", b"comment unit metre\ncomment frame "),
     "index": _is_index,

@@ -2,5 +2,6 @@
 
 from .mystery import run_mystery
 from .stage import run_demo
+from .world_demo import run_world
 
-__all__ = ["run_demo", "run_mystery"]
+__all__ = ["run_demo", "run_mystery", "run_world"]

@@ -19,10 +19,12 @@ from ...datasets.exports.lerobot import write_lerobot
 from ...datasets.exports.nerfstudio import MaskUse, place_of, write_nerfstudio
 from ...datasets.exports.selection import Selection
 from ...datasets.exports.splat_files import in_world, write_splat_files
+from ...datasets.exports.urdf import write_urdf
+from ...datasets.exports.usd import require_usd, usd_text
 from ...datasets.io.atomic import new_file
 from ...datasets.io.kinds import Kind, kind_of, refuse_other_kind
 from ...datasets.io.outputs import DirectoryKind, FileKind, may_repeat, reads, refuse_output
-from ...datasets.io.progress import note
+from ...datasets.io.progress import note, progress
 from ...datasets.models.mjcf import write_mjcf
 from ...datasets.models.model import Model, read_model
 from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
@@ -30,8 +32,8 @@ from ...schemas.quantities import MOST_DURATION_S
 from .soundness import require_sound, require_sound_files
 
 DATASET_FORMATS: tuple[ExportFormat, ...] = ("lerobot", "bop", "nerfstudio")
-MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "ply", "colmap", "glb")
-SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "glb": ".glb"}
+MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "urdf", "usd", "ply", "colmap", "glb")
+SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "usd": ".usda", "glb": ".glb"}
 """Suffixes of the formats that are single files."""
 LEAST_DURATION_S = 0.02
 """Shortest motion that is compared with MuJoCo [s]: two of its frames."""
@@ -47,6 +49,8 @@ NERFSTUDIO_NOTE = (
 )
 NO_TURNING = "in the .ply and .glb the bodies keep the light of the photos, whatever their orientation"
 NO_START = "the model has jointed bodies: the MJCF has no start, and no motion of it was compared, only places of links"
+URDF_NOTE = "a URDF has no contact law and no pose of what moves freely; each body and each jointed body has a file"
+USD_NOTE = "USD has friction and restitution of materials, but no contact time: simulators choose their own stiffness"
 NO_DRIVEN = "driven bodies are mocap bodies, whose velocity MuJoCo's friction ignores"
 
 
@@ -81,6 +85,8 @@ OPTIONS: dict[ExportFormat, tuple[str, ...]] = {
     "bop": ("split", "cameras", "every"),
     "nerfstudio": ("rollout", "cameras", "every", "mask"),
     "mjcf": ("seed", "duration_s"),
+    "urdf": ("seed",),
+    "usd": ("seed",),
     "ply": ("sh_degree",),
     "colmap": ("capture",),
     "glb": (),
@@ -94,6 +100,8 @@ _KINDS: dict[ExportFormat, DirectoryKind | FileKind] = {
     "bop": "BOP dataset",
     "nerfstudio": "nerfstudio capture",
     "mjcf": "MJCF file",
+    "urdf": "URDF folder",
+    "usd": "USD file",
     "ply": "splat file",
     "colmap": "COLMAP model",
     "glb": "glTF file",
@@ -108,9 +116,9 @@ def export(
     """Write a dataset or a model in another format.
 
     Args:
-        thing: DATASET for lerobot, bop and nerfstudio; MODEL for mjcf, ply, colmap and glb.
+        thing: DATASET for lerobot, bop and nerfstudio; MODEL for mjcf, urdf, usd, ply, colmap and glb.
         format_: The format.
-        out: The file (.xml, .glb, .ply) or directory to write; it appears once it is complete.
+        out: The file (.xml, .usda, .glb, .ply) or directory to write; it appears once it is complete.
         options: Options of the format.
         overwrite: Replace what exists.
 
@@ -198,6 +206,54 @@ def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tu
     return facts, notes + ([NO_DRIVEN] if driven else [])
 
 
+def _urdf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    from .urdf_check import urdf_deviation
+
+    model = _simulated(thing)
+    facts: Facts = {}
+
+    def check(folder: Path) -> None:
+        facts["deviation_of_links_mm"], facts["deviation_of_links_deg"] = urdf_deviation(model, folder, options.seed)
+
+    counts = write_urdf(out, model, _surfaces_of_bodies(model), check, overwrite)
+    notes = [URDF_NOTE, *_left_out(model, "URDF")]
+    if any(one.servos for one in model.file.articulations):
+        notes.append("gains of servos are not in the URDF, their torque limits are (effort)")
+    if any(joint.armature for one in model.file.articulations for joint in one.joints):
+        notes.append("the reflected inertia of joints (armature) is not in the URDF")
+    return {**counts, **facts}, notes
+
+
+def _usd(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    from .usd_check import restitutions, usd_deviation
+
+    require_usd()
+    model = _simulated(thing)
+    text, counts = usd_text(model, _surfaces_of_bodies(model), restitutions(model))
+    away_mm, away_deg = usd_deviation(model, text, options.seed)
+    with new_file(out, "USD file", overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    notes = [USD_NOTE, *_left_out(model, "USD")]
+    if any(pair.materials[0] != pair.materials[1] for pair in model.file.pairs):
+        notes.append("friction of pairs of different materials is not in the USD, which combines that of single ones")
+    if any(joint.friction or joint.armature for one in model.file.articulations for joint in one.joints):
+        notes.append("dry friction and reflected inertia of joints are not in the USD")
+    return {**counts, "deviation_of_links_mm": away_mm, "deviation_of_links_deg": away_deg}, notes
+
+
+def _left_out(model: Model, name: str) -> list[str]:
+    return [f"the effect {effect.name} is not in the {name}" for effect in model.file.effects]
+
+
+def _surfaces_of_bodies(model: Model) -> dict[str, ObjectModel]:
+    """Return the surface of the collision spheres of each body that has some, by name."""
+    return {
+        body.name: object_model(model, body.name)
+        for body in progress(model.file.bodies, "export: meshes", unit="body")
+        if len(model.collision[body.name])
+    }
+
+
 def _ply(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
     model = _visible(thing)
     if not 0 <= options.sh_degree <= 3:
@@ -277,6 +333,8 @@ _WORK: dict[ExportFormat, Callable[[Path, Path, ExportOptions, bool], tuple[Fact
     "bop": _bop,
     "nerfstudio": _nerfstudio,
     "mjcf": _mjcf,
+    "urdf": _urdf,
+    "usd": _usd,
     "ply": _ply,
     "colmap": _colmap,
     "glb": _glb,

@@ -80,6 +80,8 @@ class Recorder:
             surface = self.world.surface(b)
             if surface is not None and surface.mesh is not None:
                 points = _as_acted(points, acted, facing, depth / weight.clamp_min(1e-30))
+            elif b != GROUND:
+                points = _turned(points, acted, facing)
             place = torch.where(acted[..., None], weighted / weight.clamp_min(1e-30)[..., None], points.position)
             columns.append((total, place, points.normal, points.gap, (sliding > 0.5 * weight) & acted))
         self.steps = []
@@ -114,6 +116,13 @@ class Recorder:
         bodies = [[pair[k] for pair, n in zip(self.pairs, counts, strict=True) for _ in range(n)] for k in (0, 1)]
         columns = (torch.stack([frame[k] for frame in self.frames], 1) for k in range(5))
         return ContactRecord(torch.tensor(bodies[0]), torch.tensor(bodies[1]), *columns)
+
+
+def _turned(points: Points, acted: Tensor, facing: Tensor) -> Points:
+    """Return contacts with the normal of their impulses where that at the frame is opposite: they met another face."""
+    size = facing.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-30)
+    opposite = acted & ((facing * points.normal).sum(-1) < 0)
+    return replace(points, normal=torch.where(opposite[..., None], facing / size, points.normal))
 
 
 def _as_acted(points: Points, acted: Tensor, facing: Tensor, gap: Tensor) -> Points:

@@ -283,6 +283,8 @@ OPTIONS = (
     ("model", "export model --to mjcf --out OUT.xml --duration inf"),
     ("model", "export model --to mjcf --out OUT.xml --duration 1e12"),
     ("model", "export model --to smell --out OUT"),
+    ("model", "export model --to usd --out OUT"),
+    ("model", "export model --to urdf --out OUT --duration 0.1"),
     ("model", "export model --to bop --out OUT"),
     ("dataset", "export dataset --to bop --out OUT --cameras nothing"),
     ("dataset", "export dataset --to nerfstudio --out OUT --rollout 99"),

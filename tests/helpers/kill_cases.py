@@ -135,6 +135,11 @@ def _mjcf(folder: Path) -> Command:
     return Command(words=words, out=("out.xml",))
 
 
+def _urdf(folder: Path) -> Command:
+    model = write_small_model(folder / "model")
+    return Command(words=["export", str(model), "--to", "urdf", "--out", str(folder / "out")], out=("out",))
+
+
 def _improve(folder: Path) -> Command:
     capture, model = write_capture(folder / "capture", 3), write_small_model(folder / "model")
     words = ["improve", str(capture), "--from", str(model), "--split", "test", "--steps", "1"]
@@ -179,6 +184,7 @@ CASES: dict[str, Callable[[Path], Command]] = {
     "export bop --overwrite": _replacing(_of_dataset("export", "--to", "bop"), "--every", "2"),
     "export mjcf": _mjcf,
     "export mjcf --overwrite": _replacing(_mjcf, "--seed", "5"),
+    "export urdf": _urdf,
     "import csv": _import,
     "improve": _improve,
     "control": _control,

@@ -94,10 +94,12 @@ INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
     Number along = plain(c.impulse.z), x = plain(c.impulse.x), y = plain(c.impulse.y), across = root(x * x + y * y);
 #endif
     Vec point = com + c.arm;
-#if MESHES
+#if PAIRED
     tally.facing[0] += along * plain(c.normal.x);
     tally.facing[1] += along * plain(c.normal.y);
     tally.facing[2] += along * plain(c.normal.z);
+#endif
+#if MESHES
     tally.depth += along * plain(c.gap);
 #endif
     tally.impulse[0] += plain(c.impulse.x);

@@ -49,8 +49,11 @@ struct Constants {
 
 struct Tally {  // sums over the contacts since the last frame
     Number impulse[3], weighted[3], weight, sliding;
+#if PAIRED
+    Number facing[3];  // normal, weighted by the impulse along it
+#endif
 #if MESHES
-    Number facing[3], depth;  // normal and gap, weighted by the impulse along the normal
+    Number depth;  // gap, weighted likewise
 #endif
 };
 

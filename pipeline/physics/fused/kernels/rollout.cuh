@@ -164,11 +164,17 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
 #else
             Tally& tally = env.tallies[s];
 #endif
+#if PAIRED
+            // at the frame, the slot may have another contact than that which acted
+            Vec facing = vec(Real(tally.facing[0]), Real(tally.facing[1]), Real(tally.facing[2]));
+            facing = Real(Number(1) / greater(size(facing), Number(1e-30))) * facing;
+            bool turned = tally.weight > Number(0) && plain(dot(facing, normal)) < Number(0);
+            if (turned) normal = facing;
+#endif
 #if MESHES
             bool weighs = pair_b(p) < -1 && surface_kind(-2 - pair_b(p)) == MESH_KIND && tally.weight > Number(0);
-            if (weighs) {  // at the frame, the slot may have another contact than that which acted
-                Vec facing = vec(Real(tally.facing[0]), Real(tally.facing[1]), Real(tally.facing[2]));
-                normal = Real(Number(1) / greater(size(facing), Number(1e-30))) * facing;
+            if (weighs) {
+                normal = facing;
                 gap = Real(tally.depth / tally.weight);
             }
 #endif
