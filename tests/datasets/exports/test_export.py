@@ -760,5 +760,5 @@ def test_a_model_with_a_singular_camera_is_refused(model: Path, tmp_path: Path, 
     cameras["images"]["b.png"]["T_world_cam"][1] = [0, 0, 0, 0]
     (copy / "cameras.json").write_text(json.dumps(cameras))
     with pytest.raises(InputDataError, match=r"cameras\.json: image 'b\.png': the pose is no rotation and translation"):
-        export(copy, format_, tmp_path / f"out{'.xml' if format_ == 'mjcf' else '.glb' if format_ == 'glb' else ''}")
+        export(copy, format_, tmp_path / f"out{ {'mjcf': '.xml', 'glb': '.glb', 'usd': '.usda'}.get(format_, '') }")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model"]
