@@ -1,10 +1,12 @@
 """Real pushes of a triangle on hardboard and plywood (MLab_EXP): half of each file is fitted, the other half predicted.
 
 The end pose of each push is predicted from its measured start and the finger's track. cgwm's engine and a quasi-static
-limit surface (an ellipsoid) choose their settings on the same halves: the friction of the finger, its radius, and how
-far the supports, or the pressure of the patch, lie from the centre. Errors are medians over the other halves.
+limit surface (an ellipsoid) are fitted to the same halves by the same robust least squares, from the best of a grid on:
+both with the friction of the finger, the engine with the finger's height and, on a patch, face_exponent, the ellipsoid
+with a scale of its radius. Errors are medians over the other halves, with the share of bootstrap draws (pushes, by
+file) in which the engine is not ahead. Then the friction of each ground by the measured forces of the fitted halves.
 
-    python benchmarks/pushes.py FOLDER [--json]
+    python benchmarks/pushes.py FOLDER [--out FILE]
 
 FOLDER holds one folder for each file, named by the three supports as x1_x2_x3_y1_y2_y3 [mm] or `patch`, those on
 plywood with `wood_` before it.
@@ -14,66 +16,35 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from cgwm.datasets.importers.pushes import Push, read_pushes
-from cgwm.pipeline.physics import Body, ContactLaw, State, World
-from cgwm.pipeline.physics.engine import rollout
-from cgwm.pipeline.physics.hull import Hull
-from cgwm.pipeline.physics.kinematic import Drive
 from numpy.typing import NDArray
-from scipy.stats import wilcoxon
+from push_models import (
+    CENTER,
+    CGWM,
+    ELLIPSOID,
+    GROUND_FRICTION,
+    SAMPLES,
+    Model,
+    Pushes,
+    cgwm_forces,
+)
+from scipy.signal import savgol_filter
+from scipy.stats import t as student
 
 Array = NDArray[Any]
-F64 = torch.float64
 
-LEG_M, MASS_KG, CENTER = 0.15, 1.518, np.array([0.05, 0.05])
-GRAVITY_M_S2 = 9.81
-FRICTIONS = {"hardboard": 0.282, "plywood": 0.336}
+PUBLISHED = {"hardboard": 0.282, "plywood": 0.336}
 """Friction of the ground in the code of the authors, who measured the force of steady sliding."""
-FINGER_FRICTION = (0.1, 0.2, 0.3, 0.5, 0.8)
-FINGER_RADIUS_M = (0.0003,)
-SCALE = (0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.7)
-_HEIGHT_M, _CORNER_M, _FOOT_M = 0.02, 0.0005, 0.0005
-_STEP_S, _SAMPLES = 0.002, 120
-
-
-@dataclass(frozen=True)
-class Pushes:
-    """Pushes of one file; angles [rad], lengths [m]."""
-
-    name: str
-    """Folder of the file."""
-    start: Array
-    """x, y and angle before each push, shape (n, 3)."""
-    end: Array
-    """The same after it, shape (n, 3)."""
-    finger: Array
-    """Places of the finger at equal times, shape (n, S, 2)."""
-    duration_s: float
-    """Duration of a push [s]."""
-    force: Array
-    """Mean force on the object in the last quarter of the stroke [N], shape (n, 2)."""
-
-    def half(self, odd: bool) -> Pushes:
-        """Return the pushes with odd numbers, counted from 0, or the others."""
-        rows = slice(int(odd), None, 2)
-        return Pushes(self.name, self.start[rows], self.end[rows], self.finger[rows], self.duration_s, self.force[rows])
-
-    @property
-    def supports(self) -> Array:
-        """Places of the supports from the corner [m], shape (k, 2); for a patch 16 of equal areas."""
-        name = self.name.removeprefix("wood_")
-        if name != "patch":
-            return np.array(name.split("_"), float).reshape(2, 3).T / 1000
-        rows = 4
-        cells = [(i, j, k) for i in range(rows) for j in range(rows - i) for k in (1, 2) if k == 1 or i + j < rows - 1]
-        return np.array([[i + k / 3, j + k / 3] for i, j, k in cells]) * LEG_M / rows
+UNIT = np.array([1.0, 1.0, 0.6])
+"""Errors of x, y [mm] and angle [deg] that count alike in a fit."""
+ITERATIONS, DRAWS = 8, 4000
+SMOOTHED = 31
+"""Samples of the finger's track (0.9 s) over which it is smoothed."""
 
 
 def read(folder: Path) -> list[Pushes]:
@@ -84,15 +55,17 @@ def read(folder: Path) -> list[Pushes]:
 def _pushes(name: str, pushes: list[Push]) -> Pushes:
     poses = np.stack([_planar(push.object_track) for push in pushes])
     duration = float(np.median([push.finger_track.time_s[-1] - push.finger_track.time_s[0] for push in pushes]))
-    finger, force = [], []
+    sampled = []
     for push in pushes:
         track = push.finger_track
         share = (track.time_s - track.time_s[0]) / (track.time_s[-1] - track.time_s[0])
-        grid = np.linspace(0, 1, _SAMPLES)
-        finger.append(np.stack([np.interp(grid, share, track.position_m[:, k]) for k in (0, 1)], -1))
         assert track.force_n is not None
-        force.append(track.force_n[(share > 0.7) & (share < 0.95), :2].mean(0))
-    return Pushes(name, poses[:, 0], poses[:, -1], np.stack(finger), duration, np.stack(force))
+        # places are rounded to 0.1 mm: the staircase would rub where the finger sticks
+        smooth: Any = savgol_filter(track.position_m[:, :2], SMOOTHED, 2, axis=0)
+        columns: Any = np.concatenate([smooth, track.force_n[:, :2]], 1)
+        sampled.append(np.stack([np.interp(np.linspace(0, 1, SAMPLES), share, column) for column in columns.T], -1))
+    each: Any = np.stack(sampled)
+    return Pushes(name, poses[:, 0], poses[:, -1], each[..., :2], duration, each[..., 2:])
 
 
 def _planar(track: Any) -> Array:
@@ -100,211 +73,150 @@ def _planar(track: Any) -> Array:
     return np.stack([*track.position_m[:, :2].T, 2 * np.arctan2(q[:, 3], q[:, 0])], -1)
 
 
-def errors(found: Array, pushes: Pushes) -> Array:
-    """Return the errors of the centre [mm] and of the rotation [deg] of end poses (..., n, 3), shape (..., n, 2)."""
+def residuals(found: Array, pushes: Pushes) -> Array:
+    """Return the errors of the centre [mm] and of the angle [deg] of end poses (..., n, 3), shape (..., n, 3)."""
 
     def center(pose: Array) -> Array:
         c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
         return pose[..., :2] + np.stack([c * CENTER[0] - s * CENTER[1], s * CENTER[0] + c * CENTER[1]], -1)
 
-    away = np.linalg.norm(center(found) - center(pushes.end), axis=-1)
-    turn = np.abs((found[..., 2] - pushes.end[..., 2] + np.pi) % (2 * np.pi) - np.pi)
-    return np.stack([1e3 * away, np.degrees(turn)], -1)
+    turn = (found[..., 2] - pushes.end[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    return np.concatenate([1e3 * (center(found) - center(pushes.end)), np.degrees(turn)[..., None]], -1)
 
 
-def cgwm_ends(pushes: Pushes, settings: Array) -> Array:
-    """Return the end poses (C, n, 3) of cgwm's engine for settings (C, 3): friction, radius, scale of the supports."""
-    count, n = len(settings), len(pushes.start)
-    each = torch.as_tensor(np.repeat(settings, n, 0))
-    supports = torch.as_tensor(pushes.supports - CENTER)
-    feet = torch.cat((each[:, 2, None, None] * supports, torch.full((len(each), len(supports), 1), _FOOT_M)), -1)
-    corners = torch.tensor(
-        [[x, y, z] for x, y in ((0, 0), (LEG_M, 0), (0, LEG_M)) for z in (0.001, _HEIGHT_M)], dtype=F64
-    ) - torch.tensor([*CENTER, 0.0])
-    hull = Hull.of(corners, torch.full((6,), _CORNER_M, dtype=F64), torch.arange(6))
-    second = LEG_M**2 / 18
-    inertia = MASS_KG * torch.diag(torch.tensor([second, second, 2 * second], dtype=F64))
-    radii = torch.cat((torch.full((6,), _CORNER_M, dtype=F64), torch.full((len(supports),), _FOOT_M, dtype=F64)))
-    one = torch.ones(1, dtype=F64)
-    zero = torch.zeros(1, 3, dtype=F64)
-    thing = Body(
-        name="object", motion="free", mass=MASS_KG * one, inertia=inertia[None], com=zero + torch.tensor([0, 0, 0.001]),
-        centers=torch.cat((corners.expand(len(each), -1, -1), feet), 1), radii=radii[None],
-        on_plane=torch.arange(6, len(radii)), hull=hull, material="aluminium",
-    )  # fmt: skip
-    finger = Body(
-        name="finger", motion="driven", mass=one, inertia=torch.eye(3, dtype=F64)[None], com=zero,
-        centers=zero[None], radii=each[:, 1:2], material="finger",
-    )  # fmt: skip
-    law = ContactLaw(0.3 * one, 0.006 * one, 0.7 * one)
-    world = World(
-        bodies=(thing, finger), gravity=torch.tensor([[0, 0, -GRAVITY_M_S2]], dtype=F64),
-        ground_normal=torch.tensor([0, 0, 1.0], dtype=F64), ground_offset=0 * one, contact=law, step_s=_STEP_S,
-        pair_laws={("aluminium", "finger"): ContactLaw(each[:, 0], law.contact_time_s, law.damping_ratio)},
-    )  # fmt: skip
-    return _ends_of(world, pushes, count)
+def errors(found: Array, pushes: Pushes) -> Array:
+    """Return the distances of the centre [mm] and the angles [deg] of end poses (n, 3), shape (n, 2)."""
+    each = residuals(found, pushes)
+    return np.stack([np.linalg.norm(each[:, :2], axis=1), np.abs(each[:, 2])], -1)
 
 
-def _ends_of(world: World, pushes: Pushes, count: int) -> Array:
-    n = len(pushes.start)
-    start = torch.as_tensor(np.tile(pushes.start, (count, 1)))
-    c, s = start[:, 2].cos(), start[:, 2].sin()
-    x = start[:, 0] + c * CENTER[0] - s * CENTER[1]
-    y = start[:, 1] + s * CENTER[0] + c * CENTER[1]
-    times = torch.linspace(0, pushes.duration_s, _SAMPLES, dtype=F64)
-    track = torch.as_tensor(np.tile(pushes.finger, (count, 1, 1)))
-    track = torch.cat((track, torch.full((*track.shape[:2], 1), 0.5 * _HEIGHT_M)), -1)
-    zero, unit = torch.zeros(count * n, 3, dtype=F64), torch.tensor([1.0, 0, 0, 0], dtype=F64)
-    speed = track.diff(dim=1) / times.diff()[:, None]
-    drive = Drive.from_velocities(
-        times.expand(count * n, -1), track[:, 0], unit.expand(count * n, 4), speed, torch.zeros_like(speed)
-    )
-    half = 0.5 * start[:, 2]
-    state = State(
-        torch.stack((torch.stack((x, y, 0 * x), -1), track[:, 0]), 1),
-        torch.stack((torch.stack((half.cos(), 0 * x, 0 * x, half.sin()), -1), unit.expand(count * n, 4)), 1),
-        torch.stack((zero, zero), 1),
-        torch.stack((zero, zero), 1),
-    )
-    out = rollout(world, state, times[[0, -1]], {"finger": drive})
-    p, q = out.position_m[:, -1, 0].numpy(), out.quat_wxyz[:, -1, 0].numpy()
-    angle = 2 * np.arctan2(q[:, 3], q[:, 0])
-    c, s = np.cos(angle), np.sin(angle)
-    corner = p[:, :2] - np.stack([c * CENTER[0] - s * CENTER[1], s * CENTER[0] + c * CENTER[1]], -1)
-    return np.concatenate([corner, angle[:, None]], 1).reshape(count, n, 3)
+def fitted(model: Model, pushes: Pushes) -> Array:
+    """Return the settings (K,) of a model by robust least squares with weak priors, by Gauss-Newton and differences."""
+    settings = model.settings(pushes)
+    low, high = (np.array([getattr(one, name) for one in settings]) for name in ("low", "high"))
+    mean, std = (np.array([getattr(one, name) for one in settings]) for name in ("mean", "std"))
+
+    def scaled(tried: Array) -> Array:
+        return residuals(model.ends(pushes, tried), pushes) / UNIT
+
+    def cost(tried: Array, each: Array) -> Array:
+        loss = 2 * (np.sqrt(1 + np.square(each).sum(-1)) - 1)
+        return loss.sum(-1) + np.square((tried - mean) / std).sum(-1)
+
+    grid = np.array(list(product(*(np.clip(m + np.array([-1.0, 0, 1, 2]) * s, a, b)
+                                   for m, s, a, b in zip(mean, std, low, high, strict=True)))))  # fmt: skip
+    best = grid[cost(grid, scaled(grid)).argmin()]
+    for _ in range(ITERATIONS):
+        moves = 0.1 * np.diag(std)
+        each = scaled(np.concatenate([best[None], best + moves, best - moves]))
+        slopes = (each[1 : len(std) + 1] - each[len(std) + 1 :]) / 0.2
+        weight = 1 / np.sqrt(1 + np.square(each[0]).sum(-1))
+        normal = np.einsum("anx,bnx,n->ab", slopes, slopes, weight) + np.eye(len(std))
+        gradient = np.einsum("anx,nx,n->a", slopes, each[0], weight) + (best - mean) / std
+        steps = [np.linalg.solve(normal + k * np.diag(np.diag(normal)), gradient) for k in (0, 0.3, 3)]
+        tried = np.clip(best - std * np.array(steps), low, high)
+        costs = cost(tried, scaled(tried))
+        if costs.min() > cost(best[None], each[:1])[0] - 1e-4:
+            break
+        best = tried[costs.argmin()]
+    return best
 
 
-def ellipsoid_ends(pushes: Pushes, settings: Array) -> Array:
-    """Return the end poses (C, n, 3) of a quasi-static limit surface for settings (C, 3), as `cgwm_ends`.
+def force_ratio(pushes: Pushes, setting: Array) -> Array:
+    """Return the friction of the ground (n,) by each push: its measured forces over those of the engine.
 
-    The twist is proportional to (f, tau / c^2), c the mean distance of the supports from the centre times the scale;
-    the finger sticks where its force lies in the friction cone, and slides at the edge of the cone elsewhere (Lynch et
-    al., "Manipulation and active sensing by pushing using tactile feedback", 1992).
+    The least-squares factor over the stroke, from the 35th to the 95th hundredth; the engine's forces are proportional
+    to its own friction.
     """
-    count, n = len(settings), len(pushes.start)
-    each = np.repeat(settings, n, 0)
-    radius = each[:, 2] * np.linalg.norm(pushes.supports - CENTER, axis=1).mean()
-    pose, path = np.tile(pushes.start, (count, 1)), np.tile(pushes.finger, (count, 1, 1))
-    steps = 4
-    for k in range(_SAMPLES - 1):
-        move = (path[:, k + 1] - path[:, k]) / steps
-        for j in range(1, steps + 1):
-            pose = _pushed(pose, path[:, k] + j * move, move, each[:, 0], each[:, 1], radius)
-    return pose.reshape(count, n, 3)
+    modelled = cgwm_forces(pushes, setting)
+    measured = 0.5 * (pushes.force[:, 1:] + pushes.force[:, :-1])
+    late = slice(int(0.35 * SAMPLES), int(0.95 * SAMPLES))
+    modelled, measured = modelled[:, late], measured[:, late]
+    return GROUND_FRICTION * (modelled * measured).sum((1, 2)) / np.square(modelled).sum((1, 2))
 
 
-def _pushed(pose: Array, tip: Array, move: Array, friction: Array, tip_m: Array, radius: Array) -> Array:
-    """Move objects (n, 3) by one small step of the finger, so that it ends outside of them."""
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    local = _rotated(tip - pose[:, :2], c, -s)
-    depth, point, normal = _nearest_edge(local, tip_m)
-    arm = point - CENTER
-    u = _rotated(move, c, -s)
-    # the finger leaves the object by the whole depth: that also corrects what earlier steps left
-    u = u + (depth - (u * normal).sum(1))[:, None] * normal
-    force = _solved(arm, radius, u)
-    tangent = np.stack([-normal[:, 1], normal[:, 0]], 1)
-    along, across = (force * normal).sum(1), (force * tangent).sum(1)
-    slides = (along <= 0) | (np.abs(across) > friction * along)
-    edge = normal + (friction * np.sign(across))[:, None] * tangent
-    gained = (_velocity(arm, radius, edge) * normal).sum(1)
-    force = np.where(slides[:, None], edge * (depth / np.maximum(gained, 1e-12))[:, None], force)
-    turn = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]) / radius**2
-    moved = np.concatenate(
-        [_rotated(force - turn[:, None] * np.array([-CENTER[1], CENTER[0]]), c, s), turn[:, None]], 1
-    )
-    return np.where((depth > 0)[:, None], pose + moved, pose)
+def friction_by_ground(files: dict[str, Array]) -> list[dict[str, Any]]:
+    """Return friction of each ground, as the mean of its files' medians, with 95 % intervals.
 
-
-def _rotated(v: Array, c: Array, s: Array) -> Array:
-    return np.stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]], 1)
-
-
-def _velocity(arm: Array, radius: Array, force: Array) -> Array:
-    turn = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]) / radius**2
-    return force + turn[:, None] * np.stack([-arm[:, 1], arm[:, 0]], 1)
-
-
-def _solved(arm: Array, radius: Array, velocity: Array) -> Array:
-    """Return the forces (n, 2) that give the contact points the velocities (n, 2)."""
-    x, y = (arm / radius[:, None]).T
-    a, b, d = 1 + y * y, -x * y, 1 + x * x
-    determinant = a * d - b * b
-    return (
-        np.stack([d * velocity[:, 0] - b * velocity[:, 1], a * velocity[:, 1] - b * velocity[:, 0]], 1)
-        / (determinant[:, None])
-    )
-
-
-def _nearest_edge(tip: Array, tip_m: Array) -> tuple[Array, Array, Array]:
-    """Return depth of the finger, its contact point and the inward normal, in the object's frame; positive inside."""
-    corners = np.array([[0, 0], [LEG_M, 0], [0, LEG_M]])
-    found = []
-    for first, second in ((0, 1), (1, 2), (2, 0)):
-        edge = (corners[second] - corners[first]) / np.linalg.norm(corners[second] - corners[first])
-        inward = np.array([-edge[1], edge[0]])
-        place = np.clip((tip - corners[first]) @ edge, 0, np.linalg.norm(corners[second] - corners[first]))
-        point = corners[first] + place[:, None] * edge
-        height = (tip - corners[first]) @ inward
-        away = np.linalg.norm(tip - point, axis=1)
-        beyond = np.abs(away - np.abs(height)) > 1e-9
-        found.append((np.where(beyond, -away, height) + tip_m, point, np.broadcast_to(inward, point.shape)))
-    depths = np.stack([depth for depth, _, _ in found])
-    nearest = np.abs(depths - tip_m).argmin(0)
-    rows = np.arange(len(tip))
-    return (
-        depths[nearest, rows],
-        np.stack([p for _, p, _ in found])[nearest, rows],
-        np.stack([n for _, _, n in found])[nearest, rows],
-    )
-
-
-def chosen(model: Any, pushes: Pushes) -> Array:
-    """Return the settings (3,) with the least mean error, centre [mm] and rotation [deg] alike, on given pushes."""
-    settings = np.array(list(product(FINGER_FRICTION, FINGER_RADIUS_M, SCALE)))
-    found = errors(model(pushes, settings), pushes)
-    return settings[np.median(found, 1).sum(1).argmin()]
-
-
-def ground_friction(pushes: Pushes) -> tuple[float, float, float]:
-    """Return friction of the ground by the measured forces: 95th percentile over m g of pushes, and its interval.
-
-    Sliding without rotation needs the whole friction, turning less: in a patch the largest forces are those of nearly
-    pure translation.
+    The files were recorded on different days and places of a board, and differ by more than their pushes tell: their
+    standard deviation, the same for all grounds, is estimated from all files.
     """
-    size = np.linalg.norm(pushes.force, axis=1) / (MASS_KG * GRAVITY_M_S2)
+    grounds: dict[str, list[float]] = {}
+    for name, ratios in files.items():
+        grounds.setdefault("plywood" if name.startswith("wood_") else "hardboard", []).append(float(np.median(ratios)))
+    freedom = sum(len(values) - 1 for values in grounds.values())
+    variance = sum(float(np.var(values)) * len(values) for values in grounds.values()) / freedom
+    rows = []
+    for ground, values in grounds.items():
+        half = float(student.ppf(0.975, freedom)) * np.sqrt(variance / len(values))
+        mean = float(np.mean(values))
+        interval = [round(mean - half, 3), round(mean + half, 3)]
+        rows.append({"ground": ground, "friction": round(mean, 3), "interval": interval, "published": PUBLISHED[ground],
+                     "files": [round(value, 3) for value in values]})  # fmt: skip
+    return rows
+
+
+def compared(files: list[dict[str, Array]]) -> dict[str, Any]:
+    """Return the medians over all pushes, and the share of bootstrap draws in which cgwm is not ahead."""
     rng = np.random.default_rng(0)
-    draws = [np.percentile(rng.choice(size, len(size)), 95) for _ in range(500)]
-    return float(np.percentile(size, 95)), *(float(x) for x in np.percentile(draws, [2.5, 97.5]))
+    names = list(files[0])
+    drawn: dict[str, list[Array]] = {name: [] for name in names}
+    for _ in range(DRAWS):
+        rows = [rng.integers(len(file["cgwm"]), size=len(file["cgwm"])) for file in files]
+        for name in names:
+            drawn[name].append(np.median(np.concatenate([f[name][r] for f, r in zip(files, rows, strict=True)]), 0))
+    medians = {name: np.median(np.concatenate([file[name] for file in files]), 0).round(2).tolist() for name in names}
+    ahead = np.stack(drawn["ellipsoid"]) - np.stack(drawn["cgwm"])
+    return {
+        **medians,
+        "pushes": sum(len(file["cgwm"]) for file in files),
+        "ahead_by": np.percentile(ahead, [2.5, 97.5], axis=0).T.round(2).tolist(),
+        "not_ahead": (ahead <= 0).mean(0).round(4).tolist(),
+    }
+
+
+def predicted(train: Pushes, test: Pushes) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return the errors (n, 2) of the test half by model, and the settings of each model."""
+    found, settings = {"frozen": errors(test.start, test)}, {}
+    for model in (ELLIPSOID, CGWM):
+        settings[model.name] = fitted(model, train)
+        found[model.name] = errors(model.ends(test, settings[model.name][None], faster=1.0)[0], test)
+    return found, settings
 
 
 def main() -> None:
-    """Print the table."""
+    """Print one row for each file, one for all and one for each ground."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--out", type=Path, help="file to which the rows are written")
     arguments = parser.parse_args()
-    rows, pooled = [], {"frozen": [], "ellipsoid": [], "cgwm": []}
-    for pushes in read(arguments.folder):
-        train, test = pushes.half(False), pushes.half(True)
-        row: dict[str, Any] = {"file": pushes.name}
-        found = {"frozen": errors(test.start, test)}
-        for name, model in (("ellipsoid", ellipsoid_ends), ("cgwm", cgwm_ends)):
-            settings = chosen(model, train)
-            row[f"{name}_settings"] = settings.tolist()
-            found[name] = errors(model(test, settings[None])[0], test)
-        for name, values in found.items():
-            pooled[name].append(values)
-            row[name] = np.median(values, 0).round(3).tolist()
-        row["force_friction"] = [round(x, 3) for x in ground_friction(train)]
+    rows: list[dict[str, Any]] = []
+    found, ratios = [], {}
+
+    def add(row: dict[str, Any]) -> None:
         rows.append(row)
         print(json.dumps(row), flush=True)
-    joined = {name: np.concatenate(values) for name, values in pooled.items()}
-    last: dict[str, Any] = {name: np.median(values, 0).round(3).tolist() for name, values in joined.items()}
-    for k, name in enumerate(("centre", "rotation")):
-        test = wilcoxon(joined["cgwm"][:, k], joined["ellipsoid"][:, k])
-        last[f"p_{name}"] = float(test.pvalue)
-    print(json.dumps({"pooled": last}))
+
+    for pushes in read(arguments.folder):
+        train, test = (pushes.at(slice(first, None, 2)) for first in (0, 1))
+        each, settings = predicted(train, test)
+        found.append(each)
+        ratios[pushes.name] = force_ratio(train, settings["cgwm"])
+        medians = compared([each])
+        fits = {f"{name}_settings": values.round(4).tolist() for name, values in settings.items()}
+        add(
+            {
+                "file": pushes.name,
+                **medians,
+                **fits,
+                "friction_by_forces": round(float(np.median(ratios[pushes.name])), 3),
+            }
+        )
+    add({"file": "all", **compared(found)})
+    for row in friction_by_ground(ratios):
+        add(row)
+    if arguments.out:
+        arguments.out.write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@
 6. With few episodes, multiple shooting from several starts, the search's among them (`contact_shooting.py`): states and
    parameters together, with soft ties between short segments that absorb errors of the contact model. With many
    episodes the search alone: their mean error is smooth, and their scatter gives the intervals.
-7. Where tracks of driven bodies carry forces, what these say in addition (`measured_forces.py`).
+7. Where tracks of driven bodies carry forces, what these say in addition (`force_fit.py`).
 
 If nothing touches anything in any episode, there is no contact to search for: the contact parameters stay at their
 priors, and only effects are fitted.
@@ -66,8 +66,9 @@ from .contact_result import (
 )
 from .contact_shooting import ShootingEpisodes, shoot_contact
 from .earlier_estimates import EarlierEstimates
+from .force_fit import with_forces
 from .inertia_fit import MASS_PARTS, fit_mass_distribution
-from .measured_forces import measured_forces, with_forces
+from .measured_forces import measured_forces
 from .open_loop_search import ENOUGH_EPISODES, SearchBatch, open_loop_errors, search_contact
 from .part_choice import SCALE, asked_parts, choose_parts
 
@@ -141,7 +142,7 @@ def fit_physics(
         forces = measured_forces(ready.world, data.searched, batch.observations, force_std_n)
         if forces:
             note("phys-geo: measured forces")
-            estimate, told = with_forces(ready.world, estimate, forces, batch.observations)
+            estimate, told = with_forces(ready.world, estimate, forces, batch.observations, batch.start_cov)
             record = replace(record, forces=told)
         found = physics_fit(ready.world, earlier.kept_in(ready.world, estimate), data.noise, record)
     return _completed(found, ready)
@@ -311,8 +312,8 @@ def _with_initial_states(world: World, data: _FitData, warmup_s: float) -> Searc
     """Return the searched episodes with initial states from their warm-up."""
     observations = Observations.of(world, data.searched, data.spans)
     warm = warmup_frames(world, observations, warmup_s)
-    observations, _ = estimate_states(world, observations, warm, data.noise)
-    return SearchBatch(observations, warm)
+    observations, solution = estimate_states(world, observations, warm, data.noise)
+    return SearchBatch(observations, warm, solution.state_cov)
 
 
 def _contact_estimate(

@@ -47,6 +47,8 @@ class SearchBatch:
     """Observations of the episodes (E), with their initial states."""
     warm: Tensor
     """Frames of the warm-up, which the open-loop error leaves out, shape (E, T)."""
+    start_cov: Tensor
+    """Covariance (E, 12 nf, 12 nf) of the initial states."""
 
 
 def search_contact(

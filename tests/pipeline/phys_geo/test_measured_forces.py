@@ -10,10 +10,12 @@ from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
 from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate, PhysicsFit
-from cgwm.pipeline.phys_geo.tracks.measured_forces import force_noise, measured_forces, with_forces
+from cgwm.pipeline.phys_geo.tracks.force_fit import with_forces
+from cgwm.pipeline.phys_geo.tracks.measured_forces import force_noise, measured_forces
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import contact_parameters
+from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import FittedParameter, PhysConfig
@@ -39,9 +41,9 @@ def world() -> World:
 
 
 def push(seed: int, sideways_m: float, noise: Noise = FINE) -> Episode:
-    """A push along x at constant speed, of a finger a little beside the middle, with the force of Coulomb's law.
+    """A push along x at constant speed, of a finger at the middle or beside it, with its force.
 
-    The track comes from the engine, the force from the closed form mu m g while the box moves.
+    The track comes from the engine, the force at the middle from the closed form mu m g while the box moves.
     """
     rng = np.random.default_rng(seed)
     times = np.arange(0, 0.61, 1 / 60)
@@ -52,13 +54,29 @@ def push(seed: int, sideways_m: float, noise: Noise = FINE) -> Episode:
         ((0, 0, HALF[2] - 1e-4), UPRIGHT, (0, 0, 0), (0, 0, 0)), (tuple(path[0]), UPRIGHT, (0,) * 3, (0,) * 3)
     )
     finger = Track(times, path, np.tile(UPRIGHT, (len(times), 1)))
-    rollout = roll_out(true, start, torch.as_tensor(times), {"finger": finger})
+    rollout = roll_out(true, start, torch.as_tensor(times), {"finger": finger}, bool(sideways_m))
     position, quat = rollout.position_m[0, :, 0].numpy(), rollout.quat_wxyz[0, :, 0].numpy()
     force = np.zeros_like(path)
-    force[:, 0] = np.where(position[:, 0] > 2e-4, FRICTION * MASS * G, 0.0)
+    if sideways_m:
+        assert rollout.contacts is not None
+        each = rollout.contacts.impulse_n_s[0, 1:, rollout.contacts.body_b == 1].sum(1).numpy() * 60
+        force[1:-1] = 0.5 * (each[1:] + each[:-1])
+        force[-1] = each[-1]
+    else:
+        force[:, 0] = np.where(position[:, 0] > 2e-4, FRICTION * MASS * G, 0.0)
     force += FORCE_STD * rng.standard_normal(force.shape)
     seen = Track(times, position + noise.position_m * rng.standard_normal(position.shape), quat)
     return Episode(f"{seed}", {"box": seen, "finger": replace(finger, force_n=force)})
+
+
+def from_priors() -> ContactEstimate:
+    """What the motion leaves of the frictions where it does not tell them."""
+    parameters = contact_parameters(world())
+    return ContactEstimate(
+        parameters=parameters,
+        values=np.array([p.encode(p.prior[0]) for p in parameters]),
+        covariance=np.diag([p.prior[1] ** 2 for p in parameters]),
+    )
 
 
 @cache
@@ -77,21 +95,33 @@ def parameter(found: PhysicsFit, name: str) -> FittedParameter:
 def test_the_force_of_a_slow_push_tells_the_friction_of_the_ground() -> None:
     """From the priors alone, which is what the motion leaves of the frictions."""
     one = push(0, 0.0)
-    parameters = contact_parameters(world())
-    assert [p.name for p in parameters][::3] == ["friction[aluminium,wood]", "friction[aluminium,steel]"]
-    prior = ContactEstimate(
-        parameters=parameters,
-        values=np.array([p.encode(p.prior[0]) for p in parameters]),
-        covariance=np.diag([p.prior[1] ** 2 for p in parameters]),
-    )
+    prior = from_priors()
+    assert [p.name for p in prior.parameters][::3] == ["friction[aluminium,wood]", "friction[aluminium,steel]"]
     seen = Observations.of(world(), [one], [(-1.0, 1.0)])
     forces = measured_forces(world(), [one], seen, FORCE_STD)
     assert [force.std_n for force in forces] == [FORCE_STD]
-    found, record = with_forces(world(), prior, forces, seen)
+    found, record = with_forces(world(), prior, forces, seen, 1e-12 * torch.eye(12, dtype=torch.float64)[None])
     error = np.sqrt(found.covariance[0, 0])
     assert abs(found.values[0] - np.log(FRICTION)) < min(0.01, 1.96 * error)
     assert error < 0.01 and np.sqrt(found.covariance[3, 3]) > 0.3  # the finger's own friction hardly shows
     assert record["converged"] and record["misfit"] < 1.5
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("sideways_m", [(0.0, 0.0), (0.012, -0.02)])
+@pytest.mark.parametrize("noise", [FINE, COARSE])
+def test_intervals_from_forces_hold_the_truth(noise: Noise, sideways_m: tuple[float, float]) -> None:
+    """Of 20 fits of two pushes at least 16: starts have the errors of their first frames."""
+    held = 0
+    for seed in range(20):
+        episodes = [push(2 * seed + k, aside, noise) for k, aside in enumerate(sideways_m)]
+        seen = Observations.of(world(), episodes, [(-1.0, 1.0)] * 2)
+        seen, solution = estimate_states(world(), seen, warmup_frames(world(), seen, 0.1), noise)
+        forces = measured_forces(world(), episodes, seen, FORCE_STD)
+        found, _ = with_forces(world(), from_priors(), forces, seen, solution.state_cov)
+        held += abs(found.values[0] - np.log(FRICTION)) < 1.96 * np.sqrt(found.covariance[0, 0])
+    print(f"noise {noise.position_m:g} m, beside the middle {sideways_m}: {held} of 20")
+    assert held >= 16
 
 
 @pytest.mark.evidence
