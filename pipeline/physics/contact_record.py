@@ -81,7 +81,7 @@ class Recorder:
             if surface is not None and surface.mesh is not None:
                 points = _as_acted(points, acted, facing, depth / weight.clamp_min(1e-30))
             elif b != GROUND:
-                points = _turned(points, acted, facing)
+                points = _turned(points, acted, facing, total)
             place = torch.where(acted[..., None], weighted / weight.clamp_min(1e-30)[..., None], points.position)
             columns.append((total, place, points.normal, points.gap, (sliding > 0.5 * weight) & acted))
         self.steps = []
@@ -118,10 +118,13 @@ class Recorder:
         return ContactRecord(torch.tensor(bodies[0]), torch.tensor(bodies[1]), *columns)
 
 
-def _turned(points: Points, acted: Tensor, facing: Tensor) -> Points:
-    """Return contacts with the normal of their impulses where that at the frame is opposite: they met another face."""
+def _turned(points: Points, acted: Tensor, facing: Tensor, total: Tensor) -> Points:
+    """Return contacts with the normal of their impulses where they would pull along that at the frame.
+
+    Between two frames a sphere may have met another face, or have turned with its body.
+    """
     size = facing.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-30)
-    opposite = acted & ((facing * points.normal).sum(-1) < 0)
+    opposite = acted & ((total * points.normal).sum(-1) < 0)
     return replace(points, normal=torch.where(opposite[..., None], facing / size, points.normal))
 
 

@@ -168,7 +168,9 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
             // at the frame, the slot may have another contact than that which acted
             Vec facing = vec(Real(tally.facing[0]), Real(tally.facing[1]), Real(tally.facing[2]));
             facing = Real(Number(1) / greater(size(facing), Number(1e-30))) * facing;
-            bool turned = tally.weight > Number(0) && plain(dot(facing, normal)) < Number(0);
+            Number pushed = tally.impulse[0] * plain(normal.x) + tally.impulse[1] * plain(normal.y) +
+                            tally.impulse[2] * plain(normal.z);
+            bool turned = tally.weight > Number(0) && pushed < Number(0);
             if (turned) normal = facing;
 #endif
 #if MESHES
