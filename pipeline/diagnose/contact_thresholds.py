@@ -81,6 +81,18 @@ class SlidingThresholds:
         "as `misled`",
         "see `misled`",
     )
+    carriers: int = threshold(
+        3,
+        "episodes",
+        "the slides of one episode more than an effect has parameters, of at most so many, are predicted by those of "
+        "the others",
+        BY_ARGUMENT,
+        "real-like development, even seeds: friction by direction was named in 5 of 21 captures of an engine with a "
+        "friction pyramid, in none of the five since; how many true ones become silent is not measured",
+    )
+    carries: float = threshold(
+        0.05, "1", "share of the gain of all held-out episodes from which one counts for `carriers`", BY_ARGUMENT
+    )
     braked_otherwise: tuple[str, ...] = threshold(
         ("torsional_friction",),
         "effects",

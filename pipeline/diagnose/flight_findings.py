@@ -35,6 +35,7 @@ from .effect_selection import SelectionStep
 from .falsification import Consistency, consistency
 from .flight_search import flight_search, reselected
 from .group_values import with_group_values
+from .lasting_forces import without_lasting
 from .own_tilt import TILTS, own_tilt_step, own_tilts
 from .thresholds import THRESHOLDS
 
@@ -65,6 +66,8 @@ class FlightFindings:
     """Whether the effects have the same parameters in all episodes; None without effects."""
     others: tuple[OtherLaw, ...]
     """Alternative laws of the selected effects."""
+    fleeting: tuple[str, ...]
+    """The selected effects that are constant forces and do not act as much late in the flights as early."""
     left: RepeatedForce | None
     """What repeats from episode to episode beside the selected effects, as a law of any form; None where unknown."""
     common_share: float
@@ -116,7 +119,8 @@ class FlightFindings:
         imitated = self.repeats and self.common_share < LIMITS.common_share
         most = bool(self.in_flight) and self.explained_share >= LIMITS.enough_share
         follows = self.own_law is not None and not most
-        return inconsistent or imitated or follows or any(one.better for one in self.others)
+        other = bool(self.fleeting) or any(one.better for one in self.others)
+        return inconsistent or imitated or follows or other
 
 
 def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> FlightFindings:
@@ -212,6 +216,8 @@ def _searched(
     names = [step.best.name for step in steps if step.flagged and step.own_std is None]
     others = [] if flight is None else other_laws(flight, after_flight, names, scatter)
     better = {one.effect for one in others if one.better}
+    fleeting = set() if flight is None else without_lasting(flight, after_flight, names, scatter)
+    better |= fleeting
     if flight is not None and better and set(names) - better:
         # the law of this one is another; the others stand without it
         steps = [step for step in steps if step.best.name not in better]
@@ -236,6 +242,7 @@ def _searched(
         before=before,
         after=worst_omnibus(flight_windows(prepared, after_flight), scatter) if after_flight is not world else before,
         agreement=agreement,
+        fleeting=tuple(sorted(fleeting & set(names))),
         others=tuple(others),
         left=left,
         common_share=share,

@@ -76,6 +76,13 @@ class FlightThresholds:
         "beside slow errors a rival is ruled out where it is worse by this much in the mean over episodes",
         "by argument: with 12 episodes 0.6 % of rivals that are as good lie farther off",
     )
+    repeated_gain: float = threshold(
+        12.0,
+        "chi2",
+        "beside correlated errors, held-out episodes have to gain this without the one that gains most: odds of 400",
+        BY_ARGUMENT,
+        "real-like development, even seeds: a magnet from smeared edges of contacts gained 4, true effects 35 or more",
+    )
     measured: float = threshold(
         0.04,
         "1",
@@ -128,6 +135,20 @@ class VerdictThresholds:
         0.6,
         "1",
         "share that one tilt in each episode must explain of what tilts of all pieces of its flights do",
+    )
+    lasting_ratio: float = threshold(
+        0.5,
+        "1",
+        "a constant force that is smaller by this factor late in the flights than early, or the reverse, beyond chance "
+        "(`lasting_p`), is none",
+        BY_ARGUMENT,
+    )
+    lasting_p: float = threshold(
+        0.005,
+        "probability",
+        "see `lasting_ratio`",
+        "real-like development, even seeds: a gust named a tilt (0.001); forces that last had 0.03 or more",
+        "a gust that fills the flights (0.15 of 0.37 s) passes: early and late differ by less than their errors",
     )
     own_episodes: int = threshold(
         8,

@@ -66,6 +66,7 @@ NUMERICS = {
     "rebound_by_slip.WEAK": "width of a prior of a nuisance",
     "own_accelerations.FEWEST": "fewest pieces of a regression; fewer determine no variance",
     "own_accelerations.QUARTER_TURN": "a matrix",
+    "lasting_forces.USUAL_FLIGHT": "length of the motion that is looked at",
     "own_tilt.PIECE_S, LONGEST_S": "length of the motion that is looked at",
     "robust_fit.FALL": "end of a descent",
     "robust_fit.ITERATIONS": "end of a descent",

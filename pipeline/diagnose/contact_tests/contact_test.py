@@ -67,12 +67,23 @@ class Bar:
     """Fall of chi2 without the episode in which it falls most."""
     gain_t: float | None = None
     """Mean gain of held-out episodes in its standard errors, which then has to be positive; None demands no gain."""
+    carriers: int = 0
+    """Fewest held-out episodes of which each has the share `carries` of the gain, where it was computed; without the
+    one that gains most, the others have to gain together, too."""
+    carries: float = 0.0
+    """See `carriers`."""
 
     def passed(self, one: Evidence) -> bool:
         """Return whether the evidence reaches the minima."""
         predicts = self.gain_t is None or (one.gain > 0 and one.gain_t >= self.gain_t)
         enough = one.score >= self.score and one.share >= self.share and one.size >= self.size
-        return enough and one.without_best >= self.without_best and predicts
+        return enough and one.without_best >= self.without_best and predicts and self._carried(one)
+
+    def _carried(self, one: Evidence) -> bool:
+        """Return whether enough held-out episodes carry the effect; True where their gains were not computed."""
+        if not (self.carriers and one.gains):
+            return True
+        return one.gain > max(one.gains) and sum(gain > self.carries * one.gain for gain in one.gains) >= self.carriers
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,9 +15,9 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from ...segments.candidates import Candidate, Variant
-from ...segments.sliding_descent import ITERATIONS, SlidingFit
-from ...segments.sliding_fit import StartedSliding, better_starts, fit_sliding
+from ...segments.candidates import Candidate, Variant, with_variants
+from ...segments.sliding_descent import ITERATIONS, SlidingFit, information_by_segment
+from ...segments.sliding_fit import StartedSliding, better_starts, fit_sliding, nuisance_parameters
 from ..evidence import Evidence
 from ..thresholds import THRESHOLDS, SlidingThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
@@ -64,7 +64,15 @@ class SlidingTest(ContactTest):
         _, best = min(found, key=lambda one: one[1].cost)
         again = (best.segments, best.values[0, : base.values.shape[1]])
         least = min(base.cost, fit_sliding(started.segments.world, [], [again], started.flight_parameters)[0].cost)
-        return ranked(_judged(found, candidates, base, least, degrees))
+        evidence = ranked(_judged(found, candidates, base, least, degrees))
+        best = next((one for one in evidence if one.test.admissible), None)
+        if best is None or best.score < self.limits.score_sure:
+            return evidence
+        variant, fit = next(
+            one for one in found if candidates[one[0].place] is best.candidate and one[0].constants == best.constants
+        )
+        gains = held_out_gains(variant, fit, started)
+        return [replace(one, gains=gains) if one is best else one for one in evidence]
 
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
         """Return the leads in score, the second over effects that explain nearly as much.
@@ -91,11 +99,40 @@ class SlidingTest(ContactTest):
             # what is unexplained in flight also acts during sliding
             share=self.limits.explained if data.explained else self.limits.share_sure,
             size=self.limits.least_size,
+            # each slide tells how it is braked; what has more numbers than slides fits any
+            carriers=min(parameters + 1, self.limits.carriers),
+            carries=self.limits.carries,
             without_best=self.limits.without_best if data.flown else -math.inf,
         )
         if doubted or parameters > self.limits.many_parameters or (flexible and data.flown):
             return (usual,)
         return usual, replace(usual, score=self.limits.score_sure, share=self.limits.share_sure)
+
+
+def held_out_gains(variant: Variant, fit: SlidingFit, started: StartedSliding) -> tuple[float, ...]:
+    """Return the fall of chi2 of each episode by an effect that is estimated from the slides of the others.
+
+    The nuisance parameters are estimated from the others, too. Without the effect they are those of all episodes, so
+    that the fall is, if anything, too small.
+
+    Args:
+        variant: The effect at its constants.
+        fit: Its fit.
+        started: The sliding segments and their fit without effects.
+    """
+    world, own = with_variants(started.segments.world, [variant], "contact")
+    known = nuisance_parameters(started.segments.world, started.flight_parameters)
+    segments = fit.segments.in_world(world)
+    information, score = information_by_segment(segments, [*known, *own], fit.values[0])
+    prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in (*known, *own)]).to(information))
+    episode = torch.tensor([item.episode for item in segments.items])
+    gains = []
+    for one in episode.unique():
+        mine = episode == one
+        step = torch.linalg.solve(information[~mine].sum(0) + prior, score[~mine].sum(0))
+        predicted = step @ information[mine].sum(0) @ step - 2 * score[mine].sum(0) @ step
+        gains.append(float((started.base.chi2 - fit.chi2)[mine].sum() - predicted))
+    return tuple(gains)
 
 
 def _fits(

@@ -119,6 +119,23 @@ def named_in_sliding(given: list[Evidence], flown: bool, explained: bool = True)
 
 
 @pytest.mark.parametrize(
+    ("name", "gains", "named"),
+    [
+        ("viscous_friction", (300.0, 150.0, 0.0), True),
+        ("viscous_friction", (440.0, 10.0, 0.0), False),  # one slide carries it
+        ("viscous_friction", (500.0, 150.0, -200.0), False),  # the others predict each other worse than without it
+        ("anisotropic_friction", (300.0, 290.0, 0.0), False),  # two slides are braked along and across: any law fits
+        ("anisotropic_friction", (300.0, 290.0, 60.0), True),
+    ],
+)
+def test_slides_of_other_episodes_have_to_predict_what_is_named(
+    name: str, gains: tuple[float, ...], named: bool
+) -> None:
+    found = named_in_sliding([replace(evidence(name, 500, 0.9), gains=gains)], flown=False)
+    assert [one.name for one in found] == [name] * named
+
+
+@pytest.mark.parametrize(
     ("found", "flown", "named"),
     [
         ([("viscous_friction", 250, 0.7), ("rolling_resistance", 50, 0.1)], False, ["viscous_friction"]),
