@@ -20,6 +20,7 @@ from ..io.atomic import new_directory
 from ..models.model import Model
 from ..shapes.meshes import Mesh
 from ..shapes.surfaces import obj_text
+from ..shapes.turns import matrix_of, quat_of_normal
 from .bop_models import ObjectModel
 
 Array = NDArray[np.float64]
@@ -196,11 +197,11 @@ def _add_scene(root: ET.Element, model: Model) -> None:
     if ground is not None:
         normal = np.asarray(ground.normal)
         place = normal * (ground.offset_m - HALF_SPACE_M)
-        _add_shape(link, "box", {"size": _text([2 * HALF_SPACE_M] * 3)}, place, _turn_to(normal))
+        _add_shape(link, "box", {"size": _text([2 * HALF_SPACE_M] * 3)}, place, quat_of_normal(normal))
     for surface in model.file.surfaces:
         place, quat = np.asarray(surface.pose.position_m), np.asarray(surface.pose.quat_wxyz)
         tag, values, below = _shape(surface, surface.name in model.surface_meshes)
-        _add_shape(link, tag, values, place - below * _matrix(quat)[:, 2], quat)
+        _add_shape(link, tag, values, place - below * matrix_of(quat)[:, 2], quat)
 
 
 def _shape(surface: Surface, meshed: bool) -> tuple[str, dict[str, str], float]:
@@ -225,7 +226,7 @@ def _add_shape(link: ET.Element, tag: str, values: dict[str, str], place: Array,
 
 
 def _origin(parent: ET.Element, place: Array, quat: Array) -> None:
-    ET.SubElement(parent, "origin", xyz=_text(place), rpy=_text(roll_pitch_yaw(_matrix(quat))))
+    ET.SubElement(parent, "origin", xyz=_text(place), rpy=_text(roll_pitch_yaw(matrix_of(quat))))
 
 
 def roll_pitch_yaw(matrix: Array) -> Array:
@@ -234,26 +235,6 @@ def roll_pitch_yaw(matrix: Array) -> Array:
     if np.hypot(matrix[0, 0], matrix[1, 0]) < 1e-9:  # straight up or down: roll and yaw are about the same axis
         return np.array([np.arctan2(-matrix[1, 2], matrix[1, 1]), pitch, 0.0])
     return np.array([np.arctan2(matrix[2, 1], matrix[2, 2]), pitch, np.arctan2(matrix[1, 0], matrix[0, 0])])
-
-
-def _matrix(quat: Array) -> Array:
-    w, x, y, z = quat / np.linalg.norm(quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _turn_to(normal: Array) -> Array:
-    """Return the quaternion (4,) of the shortest turn that takes z to a unit vector."""
-    x, y, z = normal
-    if z < -1 + 1e-9:
-        return np.array([0.0, 1.0, 0.0, 0.0])
-    quat = np.array([1 + z, -y, x, 0.0])
-    return quat / np.linalg.norm(quat)
 
 
 def _text(values: object) -> str:

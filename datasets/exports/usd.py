@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ...schemas import ArticulationModel, BodyModel, ContactParameters, InputDataError, JointModel, UsageError
 from ...schemas.surfaces import Surface
 from ..models.model import Model
+from ..shapes.turns import matrix_of, quat_of_matrix, quat_of_normal, quat_product
 from .bop_models import ObjectModel
 
 Array = NDArray[np.float64]
@@ -169,7 +170,7 @@ class _Writer:
         mass.CreateMassAttr(body.mass_kg)
         mass.CreateCenterOfMassAttr(self._vec3f(body.com_m))
         mass.CreateDiagonalInertiaAttr(self._vec3f(moments))
-        mass.CreatePrincipalAxesAttr(self._quatf(quat_of(axes)))
+        mass.CreatePrincipalAxesAttr(self._quatf(quat_of_matrix(axes)))
 
     def _shape(self, body: BodyModel) -> None:
         path, spheres = self.paths[body.name], self.model.collision.get(body.name)
@@ -241,7 +242,7 @@ class _Writer:
             return
         normal = np.asarray(ground.normal, float)
         prim = self._plane(self.paths["ground"])
-        self._place(self.geom.Xformable(prim), normal * ground.offset_m, _turn_to(normal))
+        self._place(self.geom.Xformable(prim), normal * ground.offset_m, quat_of_normal(normal))
         self._collides(prim, ground.material)
 
     def _plane(self, path: str) -> Any:
@@ -283,7 +284,7 @@ class _Writer:
         # the x axis of both local frames is the joint's axis
         turn = _turn_x_to(np.asarray(joint.axis, float)) if joint.kind != "fixed" else np.array([1.0, 0, 0, 0])
         made.CreateLocalPos0Attr(self._vec3f(joint.position_m))
-        made.CreateLocalRot0Attr(self._quatf(_times(np.asarray(joint.quat_wxyz, float), turn)))
+        made.CreateLocalRot0Attr(self._quatf(quat_product(np.asarray(joint.quat_wxyz, float), turn)))
         made.CreateLocalPos1Attr(self._vec3f((0, 0, 0)))
         made.CreateLocalRot1Attr(self._quatf(turn))
         if joint.kind == "fixed":
@@ -326,33 +327,9 @@ def link_poses(model: Model, one: ArticulationModel) -> dict[str, tuple[Array, A
     found = {one.root: (np.asarray(pose.position_m, float), np.asarray(pose.quat_wxyz, float))}
     for joint in one.joints:
         place, quat = found[joint.parent]
-        offset = _rotated(quat, np.asarray(joint.position_m, float))
-        found[joint.link] = (place + offset, _times(quat, np.asarray(joint.quat_wxyz, float)))
+        offset = matrix_of(quat) @ np.asarray(joint.position_m, float)
+        found[joint.link] = (place + offset, quat_product(quat, np.asarray(joint.quat_wxyz, float)))
     return found
-
-
-def quat_of(matrix: Array) -> Array:
-    """Return the quaternion (4,), w first, of a rotation matrix (3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(matrix).as_quat(scalar_first=True)
-
-
-def _times(a: Array, b: Array) -> Array:
-    (w, x, y, z), (s, i, j, k) = a, b
-    return np.array(
-        [
-            w * s - x * i - y * j - z * k,
-            w * i + x * s + y * k - z * j,
-            w * j - x * k + y * s + z * i,
-            w * k + x * j - y * i + z * s,
-        ]
-    )
-
-
-def _rotated(quat: Array, vector: Array) -> Array:
-    turned = _times(_times(quat, np.array([0.0, *vector])), quat * [1, -1, -1, -1])
-    return turned[1:]
 
 
 def _turn_x_to(axis: Array) -> Array:
@@ -361,13 +338,4 @@ def _turn_x_to(axis: Array) -> Array:
     if x < -1 + 1e-9:
         return np.array([0.0, 0.0, 0.0, 1.0])
     quat = np.array([1 + x, 0.0, -z, y])
-    return quat / np.linalg.norm(quat)
-
-
-def _turn_to(normal: Array) -> Array:
-    """Return the quaternion (4,) of the shortest turn that takes z to a unit vector."""
-    x, y, z = normal
-    if z < -1 + 1e-9:
-        return np.array([0.0, 1.0, 0.0, 0.0])
-    quat = np.array([1 + z, -y, x, 0.0])
     return quat / np.linalg.norm(quat)

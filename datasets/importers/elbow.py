@@ -23,7 +23,7 @@ from ..capture.tracks import Track
 from ..io.atomic import new_directory
 from ..io.outputs import reads
 from ..robots import JointOfRobot, read_articulation
-from ..robots.articulation import matrix_of, quat_of_matrix
+from ..shapes.turns import matrix_of, quat_of_matrix
 from .recordings import Recording, drawn_splits, write_recordings
 from .tensors import read_tensor
 

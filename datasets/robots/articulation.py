@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...schemas import InputDataError
 from ..shapes.meshes import Mesh
+from ..shapes.turns import matrix_of, quat_of_matrix, quat_product
 
 Array = NDArray[np.float64]
 LARGEST_M = 20.0
@@ -195,40 +196,9 @@ class Articulation:
                 home[joint.link] = (carrier, turned, moved)
                 continue
             home[joint.link] = (joint.link, np.eye(3), np.zeros(3))
-            quat = _product(quat_of_matrix(turn), joint.quat_wxyz)
+            quat = quat_product(quat_of_matrix(turn), joint.quat_wxyz)
             joints.append(replace(joint, parent=carrier, position_m=moved, quat_wxyz=quat))
         return Articulation.tree(self.name, self.path, links, joints)
-
-
-def matrix_of(quat_wxyz: Array) -> Array:
-    """Return the rotation (3, 3) of a unit quaternion (4,)."""
-    w, x, y, z = quat_wxyz / np.linalg.norm(quat_wxyz)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def quat_of_matrix(matrix: Array) -> Array:
-    """Return the quaternion (4,), w first, of a rotation (3, 3): the largest eigenvector of its quadratic form."""
-    m = matrix
-    form = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(form)[1][:, -1]
-
-
-def _product(a: Array, b: Array) -> Array:
-    w, v, s, u = a[0], a[1:], b[0], b[1:]
-    return np.concatenate(([w * s - v @ u], w * u + s * v + np.cross(v, u)))
 
 
 def _merged(carrier: LinkOfRobot, link: LinkOfRobot, turn: Array, shift: Array) -> LinkOfRobot:

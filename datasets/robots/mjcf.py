@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...schemas import InputDataError
 from ..shapes.meshes import Mesh
+from ..shapes.turns import matrix_of
 from .articulation import Articulation, GeometryOfLink, JointOfRobot, LinkOfRobot
 
 Array = NDArray[np.float64]
@@ -82,7 +83,7 @@ def _append(
         last = count == len(moving) - 1
         own = name if last else f"{name}/{model.joint(number).name or number}"
         shift = model.jnt_pos[number] - anchor
-        joints.append(_joint(model, number, parent, own, position + _rotation(quat) @ shift, quat))
+        joints.append(_joint(model, number, parent, own, position + matrix_of(quat) @ shift, quat))
         links[own] = _link(model, body, own, model.jnt_pos[number] if last else None)
         parent, position, quat, anchor = own, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), model.jnt_pos[number].copy()
     if not moving:
@@ -129,7 +130,7 @@ def _link(model: Any, body: int, name: str, origin: Array | None) -> LinkOfRobot
     """Return a link with its frame at `origin` of a body; for None one without mass."""
     if origin is None:
         return LinkOfRobot(name=name, mass_kg=0.0, com_m=np.zeros(3), inertia_kg_m2=np.zeros((3, 3)), geometry=())
-    turn = _rotation(model.body_iquat[body])
+    turn = matrix_of(model.body_iquat[body])
     geoms = range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
     parts = [
         _geometry(model, geom, origin)
@@ -160,18 +161,7 @@ def _geometry(model: Any, geom: int, origin: Array) -> GeometryOfLink:
     return GeometryOfLink(
         kind=kind,
         size_m=tuple(float(x) for x in sizes),
-        rotation=_rotation(model.geom_quat[geom]),
+        rotation=matrix_of(model.geom_quat[geom]),
         position_m=model.geom_pos[geom] - origin,
         mesh=mesh,
-    )
-
-
-def _rotation(quat: Array) -> Array:
-    w, x, y, z = quat
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
     )
