@@ -31,7 +31,7 @@ import mujoco.rollout
 import numpy as np
 import torch
 from cgwm.datasets.models.model import Model, read_model
-from cgwm.datasets.shapes.meshes import Mesh, mass_properties, read_mesh
+from cgwm.datasets.shapes.meshes import Mesh, joined_properties, read_mesh
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.datasets.synthetic.objects import FAMILIES, make_object, resting_down
 from cgwm.pipeline.control.controller import Controller, ControlPlan, ControlState
@@ -107,13 +107,8 @@ def scene(name: str, folder: Path) -> Scene:
 
 def _body(parts: list[Mesh], mass: float, down: np.ndarray, spheres: Splats) -> tuple[BodyModel, Splats]:
     """Return the body at rest, with the mass properties of parts of one density."""
-    solids = [mass_properties(part) for part in parts]
-    volume = sum(solid.volume_m3 for solid in solids)
-    com = sum((solid.volume_m3 * solid.com_m for solid in solids), np.zeros(3)) / volume
-    inertia = np.zeros((3, 3))
-    for solid in solids:
-        arm, share = solid.com_m - com, mass * solid.volume_m3 / volume
-        inertia += share * (solid.inertia_per_kg + arm @ arm * np.eye(3) - np.outer(arm, arm))
+    solid = joined_properties(parts, "a part of the object")
+    com, inertia = solid.com_m, mass * solid.inertia_per_kg
     six = tuple(float(inertia[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
     quat = _upright(down)
     body = BodyModel(

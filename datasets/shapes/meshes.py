@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -93,6 +94,28 @@ def mass_properties(mesh: Mesh, path: Path | str = "mesh") -> SolidProperties:
     """
     check_closed(mesh, path)
     return solid_properties(mesh, path)
+
+
+def joined_properties(parts: Sequence[Mesh], what: str) -> SolidProperties:
+    """Return volume, centre of mass and inertia of closed parts of one density that do not overlap.
+
+    Source: the parallel-axis theorem.
+
+    Args:
+        parts: Closed meshes.
+        what: One of them, for messages.
+
+    Raises:
+        InputDataError: If one is not closed, or as of `mass_properties`.
+    """
+    solids = [mass_properties(part, what) for part in parts]
+    volume = sum(solid.volume_m3 for solid in solids)
+    com = sum((solid.volume_m3 * solid.com_m for solid in solids), np.zeros(3)) / volume
+    inertia = np.zeros((3, 3))
+    for solid in solids:
+        arm, share = solid.com_m - com, solid.volume_m3 / volume
+        inertia += share * (solid.inertia_per_kg + arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return SolidProperties(volume, com, inertia)
 
 
 def solid_properties(mesh: Mesh, path: Path | str = "mesh") -> SolidProperties:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from ...datasets.shapes.meshes import Mesh, mass_properties, read_mesh
+from ...datasets.shapes.meshes import Mesh, joined_properties, mass_properties, read_mesh
 from ...schemas import InputDataError, NotConvergedError
 from ..geometry.rotation import quat_multiply
 from .goal import turned
@@ -113,7 +113,8 @@ def scene_mjcf(found: TaskWorld, parts: list[Mesh]) -> str:
         parts: Convex parts of the object, in its frame.
     """
     task, plant = found.task, found.task.plant
-    mass, com, inertia = _mass_properties(parts, _true_mass(found))
+    mass, solid = _true_mass(found), joined_properties(parts, "a part of the object")
+    com, inertia = solid.com_m, mass * solid.inertia_per_kg
     ground, finger = (plant.friction_factor * value for value in _frictions(found))
     servo, robot = task.servo, task.robot
     damping = 2 * servo.damping_ratio * math.sqrt(servo.stiffness_n_m * servo.mass_kg)
@@ -184,18 +185,6 @@ def _parts(found: TaskWorld) -> list[Mesh]:
             )
         parts.append(Mesh(found.task.plant.size_factor * mesh.vertices, mesh.faces))
     return parts
-
-
-def _mass_properties(parts: list[Mesh], mass_kg: float) -> tuple[float, Array, Array]:
-    """Return mass [kg], centre of mass [m] and inertia about it [kg m2] of parts of one density."""
-    solids = [mass_properties(part, "a part of the object") for part in parts]
-    volume = sum(solid.volume_m3 for solid in solids)
-    com = sum((solid.volume_m3 * solid.com_m for solid in solids), np.zeros(3)) / volume
-    inertia = np.zeros((3, 3))
-    for solid in solids:
-        arm, mass = solid.com_m - com, mass_kg * solid.volume_m3 / volume
-        inertia += mass * (solid.inertia_per_kg + arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return mass_kg, com, inertia
 
 
 def _text(values: Any) -> str:
