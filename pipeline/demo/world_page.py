@@ -34,7 +34,8 @@ def world_html(result: WorldDemoResult, png: bytes) -> str:
     body = [
         f"<h1>cgwm demo · scene {result.scene} · seed {result.seed}</h1>",
         paragraph(result.verdict, "verdict"),
-        f'<p><img src="data:image/png;base64,{shown}" alt="The first rollout at three moments"></p>',
+        f'<p><img src="data:image/png;base64,{shown}" alt="The first rollout at three moments" '
+        'style="max-width:100%"></p>',
         section(
             "Contact parameters",
             table(["parameter", "estimate", "95 % interval", "truth", "unit"], rows),
@@ -46,7 +47,7 @@ def world_html(result: WorldDemoResult, png: bytes) -> str:
         section(
             "Test episodes",
             paragraph(
-                f"Open-loop error on {result.evaluation.episodes} test episodes: {fixed(error, 1, 1e3)} mm (median)."
+                f"Open-loop error: {fixed(error, 1, 1e3)} mm (median; test episodes: {result.evaluation.episodes})."
             ),
         ),
         section("Files", facts(files)),
