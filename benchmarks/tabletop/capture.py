@@ -15,14 +15,16 @@ from cgwm.datasets.synthetic.plan import ScenePlan
 from cgwm.datasets.synthetic.record import build_set, record
 from cgwm.schemas import InputDataError, UsageError, did_you_mean
 
+from .engines import ENGINES, refusal
 from .materials import MATERIALS
 from .objects import OBJECTS, Item, load_item
 from .plan import FRAME_RATE
-from .pushes import plan_pushes
+from .pushes import plan_pushes, plan_tips
 from .tosses import plan_tosses
 
-Task = Literal["fall", "push"]
-TASKS: tuple[Task, ...] = ("fall", "push")
+Task = Literal["fall", "push", "tip"]
+PLANS = {"fall": plan_tosses, "push": plan_pushes, "tip": plan_tips}
+TASKS: tuple[Task, ...] = ("fall", "push", "tip")
 PARTS_FILE = "truth_parts.npz"
 _SAMPLES = 2  # at each of the three moments of an exposure
 _STILL = 3e-5  # metres and entries of quaternions: a fiftieth of a pixel
@@ -49,7 +51,7 @@ def make_capture(
         folder: Directory that takes the capture.
         obj: One of `OBJECTS`.
         material: One of `MATERIALS`.
-        task: "fall" or "push".
+        task: One of `TASKS`.
         seed: Draws motion, cameras, light and noise.
         tests: Number of test episodes.
         video_size: Width and height of the video frames [px].
@@ -81,17 +83,27 @@ def make_capture(
 
 
 def plan_capture(
-    item: Item, obj: str, material: str, task: Task, seed: int, tests: int
+    item: Item, obj: str, material: str, task: Task, seed: int, tests: int, engine: str = "mujoco"
 ) -> tuple[ScenePlan, dict[str, int]]:
-    """Draw every episode's true motion; nothing is rendered. Also returns the numbers of draws left out, by reason."""
+    """Draw every episode's true motion; nothing is rendered. Also returns the numbers of draws left out, by reason.
+
+    What is drawn does not depend on the engine, but what is left out does.
+
+    Raises:
+        UsageError: If the engine cannot simulate the object, or is not installed.
+        NotConvergedError: If no motion serves.
+    """
+    reason = refusal(engine, item.solid)
+    if reason is not None:
+        raise UsageError(f"the engine {engine} cannot simulate {obj}: {reason}.", ", ".join(ENGINES) + ".")
     scene_seed = zlib.crc32(f"{obj}/{seed}".encode())
     rng = np.random.default_rng([scene_seed, 20])
     photo_qpos = rest_pose(item.solid, item.down, rng.uniform(-np.pi, np.pi), *rng.uniform(-0.01, 0.01, 2))
-    motions = plan_tosses if task == "fall" else plan_pushes
     rng = np.random.default_rng([scene_seed, 21, zlib.crc32(f"{material}/{task}".encode())])
     contact = MATERIALS[material]
-    episodes, rejected = motions(rng, scene_seed, item.solid, item.down, contact, tests)
-    fingertip = task == "push"
+    make = ENGINES[engine].make
+    episodes, rejected = PLANS[task](rng, scene_seed, item.solid, item.down, contact, tests, make)
+    fingertip = task != "fall"
     plan = ScenePlan(
         name=task,
         seed=scene_seed,

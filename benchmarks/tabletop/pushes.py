@@ -1,9 +1,15 @@
-"""Push: a driven fingertip strikes an object at rest and stops; the object slides on, turns and comes to rest."""
+"""Push and Tip: a driven fingertip strikes an object at rest and stops.
+
+Push: it strikes low; the object slides on, turns and comes to rest. Tip: it strikes high an object that stands on its
+tallest rest; the object topples and comes to rest on another face.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from cgwm.datasets.synthetic.dynamics import (
@@ -17,7 +23,6 @@ from cgwm.datasets.synthetic.dynamics import (
     matrix_from_quat,
     mujoco,
     rest_pose,
-    simulate,
     smooth_path,
 )
 from cgwm.datasets.synthetic.objects import SolidObject
@@ -25,7 +30,10 @@ from cgwm.datasets.synthetic.plan import EpisodePlan, stays_in_view, tilted_deg
 from cgwm.datasets.synthetic.rig import video_cameras
 from cgwm.schemas import NotConvergedError
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
+from .engines import Maker
+from .engines.mujoco_engine import Coulomb
 from .plan import CANDIDATES, FRAME_RATE, RESTING_M_S, TEST_FRAMES, TRAIN_FRAMES, episode_names, speed_at_end
 
 Array = NDArray[np.float64]
@@ -38,10 +46,35 @@ _STOPS_S = 0.27
 _SLIDES_M = 0.012
 """How far the object of the training push slides at least once the fingertip has stopped."""
 _TILT_DEG = 6.0
+_FOOTHOLD_M = 0.008
+_TOPPLES_DEG, _TIPS_DEG = 45.0, 12.0
+"""How far a test object has fallen over at the end, and the training one within its 15 frames."""
+
+
+@dataclass(frozen=True)
+class Strike:
+    """How an object is struck, and what it is to do.
+
+    Args:
+        height: Heights of the fingertip as shares of that of the object's top and of its centre of mass; the lower one
+            counts.
+        offset: Largest distance of the fingertip's line from the centre of mass, in half breadths of the object.
+        fault: Returns why a motion is of no use, given when the fingertip stops, where that matters.
+    """
+
+    height: tuple[float, float]
+    offset: float
+    fault: Callable[[Motion, float | None], str | None]
 
 
 def plan_pushes(
-    rng: np.random.Generator, camera_seed: int, solid: SolidObject, down: Array, contact: ContactTruth, tests: int
+    rng: np.random.Generator,
+    camera_seed: int,
+    solid: SolidObject,
+    down: Array,
+    contact: ContactTruth,
+    tests: int,
+    make: Maker = Coulomb,
 ) -> tuple[tuple[EpisodePlan, ...], dict[str, int]]:
     """Draw one push to train on and others to test on, each straight, of its own heading, offset and speed.
 
@@ -50,7 +83,72 @@ def plan_pushes(
     Raises:
         NotConvergedError: If no push moves the object as wanted.
     """
+    return _plan(Strike((0.35, 0.7), 0.4, _fault), rng, camera_seed, solid, down, contact, tests, make)
+
+
+def plan_tips(
+    rng: np.random.Generator,
+    camera_seed: int,
+    solid: SolidObject,
+    down: Array,
+    contact: ContactTruth,
+    tests: int,
+    make: Maker = Coulomb,
+) -> tuple[tuple[EpisodePlan, ...], dict[str, int]]:
+    """Draw one push that topples the object to train on and others to test on; `down` is not used, see `tall_rest`.
+
+    Args and returns are those of `plan_tosses`.
+
+    Raises:
+        NotConvergedError: If no push topples the object.
+    """
+    strike = Strike((0.9, 2.0), 0.15, _stands)
+    return _plan(strike, rng, camera_seed, solid, tall_rest(solid), contact, tests, make)
+
+
+def tall_rest(solid: SolidObject) -> Array:
+    """Return the body direction that points down where the object stands tallest, shape (3,).
+
+    Of all facets of the convex hull on which it stands by more than `_FOOTHOLD_M` from every edge, that over which the
+    centre of mass is highest.
+
+    Raises:
+        NotConvergedError: If it stands on none so well.
+    """
+    hull = ConvexHull(solid.vertices - solid.com)
+    best: tuple[float, Array] | None = None
+    for equation in np.unique(hull.equations.round(6), axis=0):
+        normal, height = equation[:3], -equation[3]
+        corners = hull.points[hull.points @ normal > height - 1e-4]
+        side = np.linalg.svd(normal[None])[2][1:]
+        foot = corners @ side.T
+        if len(foot) < 3 or np.linalg.matrix_rank(foot - foot[0], tol=1e-3) < 2:
+            continue
+        room = -ConvexHull(foot).equations[:, 2].max()  # the centre of mass is the origin
+        if room > _FOOTHOLD_M and (best is None or height > best[0]):
+            best = height, normal
+    if best is None:
+        raise NotConvergedError(f"tip: the {solid.family} stands on no facet.")
+    return best[1]
+
+
+def _plan(
+    strike: Strike,
+    rng: np.random.Generator,
+    camera_seed: int,
+    solid: SolidObject,
+    down: Array,
+    contact: ContactTruth,
+    tests: int,
+    make: Maker,
+) -> tuple[tuple[EpisodePlan, ...], dict[str, int]]:
+    """Draw motions; see `plan_pushes`.
+
+    Raises:
+        NotConvergedError: If no push moves the object as wanted.
+    """
     model, cameras = build_model(solid, contact, fingertip=True), video_cameras(camera_seed).values()
+    engine = make(solid, contact, True)
     rejected: Counter[str] = Counter()
     episodes: list[EpisodePlan] = []
     for index, name in enumerate(episode_names(tests)):
@@ -60,15 +158,15 @@ def plan_pushes(
         best: tuple[float, Motion] | None = None
         candidates = 0
         for _ in range(_TRIES):
-            qpos, points, speed = _push(rng, model, solid, down, split)
+            qpos, points, speed = _push(strike, rng, model, solid, down, split)
             stops = float(np.linalg.norm(points[1] - points[0])) / speed + _RAMP_S
             if stops > _STOPS_S:
                 rejected["stops late"] += 1
                 continue
-            motion = simulate(
-                model, qpos, np.zeros(6), -_SETTLING_S, duration, smooth_path(points, speed, _RAMP_S, times)
+            motion = engine.simulate(
+                qpos, np.zeros(6), -_SETTLING_S, duration, smooth_path(points, speed, _RAMP_S, times)
             )
-            fault = _fault(motion, stops if split == "train" else None)
+            fault = strike.fault(motion, stops if split == "train" else None)
             if fault is None and not stays_in_view(solid, motion, cameras):
                 fault = "out of view"
             if fault is None:
@@ -81,13 +179,14 @@ def plan_pushes(
                 fault = "no rest"
             rejected[fault] += 1
         if best is None:
-            raise NotConvergedError(f"push: none of {_TRIES} pushes of the {solid.family} serves as episode {name}.")
+            reasons = ", ".join(f"{reason} {count}" for reason, count in rejected.items())
+            raise NotConvergedError(f"none of {_TRIES} pushes of the {solid.family} serves ({reasons}).")
         episodes.append(EpisodePlan(name, split, frames, best[1]))
     return tuple(episodes), dict(rejected)
 
 
 def _push(
-    rng: np.random.Generator, model: MjModel, solid: SolidObject, down: Array, split: str
+    strike: Strike, rng: np.random.Generator, model: MjModel, solid: SolidObject, down: Array, split: str
 ) -> tuple[Array, Array, float]:
     """Draw a push: the object's pose at rest (7,), the fingertip's path [m] of shape (2, 3), and its speed [m/s]."""
     heading = rng.uniform(-np.pi, np.pi)
@@ -100,8 +199,8 @@ def _push(
     world = solid.vertices @ turn.T + qpos[:3]
     com = solid.com @ turn.T + qpos[:3]
     breadth = np.abs((world[:, :2] - com[:2]) @ aside).max()
-    offset = rng.uniform(-0.4, 0.4) * breadth
-    height = max(min(0.35 * world[:, 2].max(), 0.7 * com[2]), FINGERTIP_RADIUS + 0.004)
+    offset = rng.uniform(-strike.offset, strike.offset) * breadth
+    height = max(min(strike.height[0] * world[:, 2].max(), strike.height[1] * com[2]), FINGERTIP_RADIUS + 0.004)
     beside = np.array([*(com[:2] + offset * aside), height])
     touches = _reach(model, qpos, beside, direction)
     # Far enough away that it has its full speed when it touches.
@@ -140,3 +239,12 @@ def _fault(motion: Motion, stops: float | None) -> str | None:
     if stops is not None and np.linalg.norm(last[:2] - motion.qpos[motion.row(stops), :2]) < _SLIDES_M:
         return "no slide"
     return None
+
+
+def _stands(motion: Motion, stops: float | None) -> str | None:
+    """Return why a toppling is of no use; `stops` is given for the short training motion."""
+    first, last = motion.qpos[motion.row(0.0)], motion.qpos[-1]
+    if motion.first_contact is None:
+        return "not struck"
+    tilt = tilted_deg(first[3:7], last[3:7])
+    return None if tilt > (_TOPPLES_DEG if stops is None else _TIPS_DEG) else "stands"

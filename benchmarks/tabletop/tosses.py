@@ -10,12 +10,10 @@ from cgwm.datasets.synthetic.dynamics import (
     STEPS_PER_S,
     ContactTruth,
     Motion,
-    build_model,
     lowest,
     matrix_from_quat,
     quat_from_matrix,
     rest_pose,
-    simulate,
 )
 from cgwm.datasets.synthetic.fall import unpredictability
 from cgwm.datasets.synthetic.objects import SolidObject
@@ -24,6 +22,8 @@ from cgwm.datasets.synthetic.rig import video_cameras
 from cgwm.schemas import NotConvergedError
 from numpy.typing import NDArray
 
+from .engines import Maker
+from .engines.mujoco_engine import Coulomb
 from .plan import CANDIDATES, FRAME_RATE, RESTING_M_S, TEST_FRAMES, TRAIN_FRAMES, episode_names, speed_at_end
 
 Array = NDArray[np.float64]
@@ -37,7 +37,13 @@ _TOUCHES_M = 0.0005
 
 
 def plan_tosses(
-    rng: np.random.Generator, camera_seed: int, solid: SolidObject, down: Array, contact: ContactTruth, tests: int
+    rng: np.random.Generator,
+    camera_seed: int,
+    solid: SolidObject,
+    down: Array,
+    contact: ContactTruth,
+    tests: int,
+    make: Maker = Coulomb,
 ) -> tuple[tuple[EpisodePlan, ...], dict[str, int]]:
     """Draw one toss to train on and others to test on; every second test is thrown spinning, the others flat.
 
@@ -48,6 +54,7 @@ def plan_tosses(
         down: The body direction that points down at rest, shape (3,).
         contact: The true contact.
         tests: Number of test episodes.
+        make: Makes the engine whose motions are the truth.
 
     Returns:
         The episodes, and how many draws were left out for which reason.
@@ -55,7 +62,7 @@ def plan_tosses(
     Raises:
         NotConvergedError: If no toss stays in view.
     """
-    model, cameras = build_model(solid, contact, fingertip=False), video_cameras(camera_seed).values()
+    engine, cameras = make(solid, contact, False), video_cameras(camera_seed).values()
     rejected = {"like another": 0, "contact time": 0, "no slip": 0, "out of view": 0, "chaotic": 0, "no rest": 0}
     episodes: list[EpisodePlan] = []
     for index, name in enumerate(episode_names(tests)):
@@ -63,12 +70,16 @@ def plan_tosses(
         duration = frames / FRAME_RATE
         best: tuple[float, Motion] | None = None
         candidates = 0
+
+        def again(other: ContactTruth, qpos: Array, qvel: Array, duration: float = duration) -> Motion:
+            return make(solid, other, False).simulate(qpos, qvel, -EXPOSURE_LEAD_S, duration)
+
         for _ in range(_TRIES):
             qpos, qvel = _release(rng, solid, down, contact.friction, split, spinning=index % 2 == 0)
             if any(turned_deg(qpos[3:7], other.motion.qpos[0, 3:7]) < 15 for other in episodes):
                 rejected["like another"] += 1
                 continue
-            motion = simulate(model, qpos, qvel, -EXPOSURE_LEAD_S, duration)
+            motion = engine.simulate(qpos, qvel, -EXPOSURE_LEAD_S, duration)
             first, last = (0.10, 0.17) if split == "train" else (0.12, 0.3)
             if motion.first_contact is None or not first < motion.first_contact < last:
                 rejected["contact time"] += 1
@@ -76,7 +87,7 @@ def plan_tosses(
                 rejected["no slip"] += 1
             elif not stays_in_view(solid, motion, cameras):
                 rejected["out of view"] += 1
-            elif unpredictability(rng, solid, contact, motion, duration, _CHAOTIC) > _CHAOTIC:
+            elif unpredictability(rng, contact, motion, _CHAOTIC, again) > _CHAOTIC:
                 rejected["chaotic"] += 1
             else:
                 candidates += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -64,6 +65,10 @@ def _toss(
     duration = (TRAIN_FRAMES if split == "train" else TEST_FRAMES) / FRAME_RATE
     cameras = video_cameras(seed).values()
     useful: list[tuple[float, Motion]] = []
+
+    def again(other: ContactTruth, qpos: Array, qvel: Array) -> Motion:
+        return simulate(build_model(solid, other, fingertip=False), qpos, qvel, -EXPOSURE_LEAD_S, duration)
+
     for _ in range(_TRIES):
         qpos, qvel = _release(rng, solid)
         if any(turned_deg(qpos[3:7], other) < 35 for other in others):
@@ -75,7 +80,7 @@ def _toss(
         near = np.linalg.norm(motion.qpos[:, :2], axis=1).max() < 0.22
         if wanted and near and stays_in_view(solid, motion, cameras):
             best = min((value for value, _ in useful), default=np.inf)
-            useful.append((unpredictability(rng, solid, contact, motion, duration, best), motion))
+            useful.append((unpredictability(rng, contact, motion, best, again), motion))
             if useful[-1][0] < _PREDICTABLE or len(useful) == _CANDIDATES:
                 break
     if not useful:
@@ -108,11 +113,10 @@ def _instructive(motion: Motion) -> bool:
 
 def unpredictability(
     rng: np.random.Generator,
-    solid: SolidObject,
     contact: ContactTruth,
     motion: Motion,
-    duration: float,
     enough: float,
+    again: Callable[[ContactTruth, Array, Array], Motion],
 ) -> float:
     """Return the error of the true engine itself when it starts from indistinguishable states and parameters.
 
@@ -120,6 +124,13 @@ def unpredictability(
     faces. Each restart differs by the accuracy of a state measured over 0.1 s and by one of `_MATERIALS`; the result is
     the mean error over time and restarts, in units of 10 mm and 10 degrees. Restarts end as soon as the result is
     certain to exceed `enough`.
+
+    Args:
+        rng: Source of randomness.
+        contact: The true contact.
+        motion: The true motion.
+        enough: Value above which the exact result does not matter.
+        again: Simulates a motion of the same length from another contact, qpos and qvel.
     """
     total = 0.0
     for friction, damping in _MATERIALS:
@@ -130,9 +141,9 @@ def unpredictability(
         qvel[:3] += 0.006 * rng.standard_normal(3)
         qvel[3:6] += 0.06 * rng.standard_normal(3)
         other = replace(contact, friction=friction * contact.friction, damping_ratio=damping * contact.damping_ratio)
-        again = simulate(build_model(solid, other, fingertip=False), qpos, qvel, motion.start, duration)
-        shift = np.linalg.norm(again.qpos[:, :3] - motion.qpos[:, :3], axis=1).mean()
-        turns = [turned_deg(a, b) for a, b in zip(again.qpos[::200, 3:7], motion.qpos[::200, 3:7], strict=True)]
+        restart = again(other, qpos, qvel)
+        shift = np.linalg.norm(restart.qpos[:, :3] - motion.qpos[:, :3], axis=1).mean()
+        turns = [turned_deg(a, b) for a, b in zip(restart.qpos[::200, 3:7], motion.qpos[::200, 3:7], strict=True)]
         total += (float(shift) / 0.01 + float(np.mean(turns)) / 10) / len(_MATERIALS)
         if total > enough:
             break

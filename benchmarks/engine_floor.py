@@ -1,0 +1,197 @@
+"""The floor of Fall, Push and Tip against several engines: our law of contact with the true shape, mass and friction.
+
+    pip install --no-deps -r benchmarks/requirements.txt
+    python benchmarks/engine_floor.py run --stage dev --workers 2
+    python benchmarks/engine_floor.py run --stage report --workers 2
+    python benchmarks/engine_floor.py table
+
+Nothing is fitted, filmed or rendered: what an open-loop prediction from the true state misses by is what the law cannot
+express, or what nobody can predict. Friction is the engine's own. Natural time and damping ratio have a counterpart in
+MuJoCo alone; the row `stated` takes the numbers from which every engine's contacts were made, the row `best` those of a
+grid that predict the development captures of the same engine and ground best, over all tasks and objects.
+
+Captures are drawn by seeds: those of development from 100 on, those of the report from 500 on. A cell that an engine
+cannot simulate is printed with its reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import multiprocessing
+import os
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cgwm.schemas import NotConvergedError
+from store import Store, timed
+from tabletop.capture import TASKS, Task, plan_capture
+from tabletop.engines import ENGINES, refusal
+from tabletop.materials import MATERIALS
+from tabletop.objects import load_item
+from tabletop.true_world import Numbers, Spheres, pose_errors, spheres_of, true_world
+
+FIRST_SEED = {"dev": 100, "report": 500}
+OBJECTS = ("box", "l_block", "mustard_bottle", "mug")
+TIMES_S = (0.002, 0.003, 0.0045, 0.007, 0.011, 0.017)
+RATIOS = (0.15, 0.25, 0.4, 0.6, 0.9)
+UNIT_MM, UNIT_DEG = 10.0, 10.0
+"""Errors count in these units where one number must be found."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One capture: `tests` motions of an object on a ground, by an engine."""
+
+    stage: str
+    engine: str
+    task: Task
+    object: str
+    material: str
+    seed: int
+    tests: int
+
+    @property
+    def key(self) -> str:
+        """The result's key in the store."""
+        return "/".join(str(value) for value in vars(self).values())
+
+
+def jobs(stage: str, engines: Sequence[str], captures: int, tests: int) -> list[Job]:
+    """Return the captures: per engine and task so many, objects and grounds in turn, each of a seed of its own."""
+    pairs = list(itertools.product(OBJECTS, MATERIALS))
+    order = np.random.default_rng(0).permutation(len(pairs))
+    result = []
+    for task, index in itertools.product(TASKS, range(captures)):
+        obj, material = pairs[order[index % len(pairs)]]
+        result += [Job(stage, engine, task, obj, material, FIRST_SEED[stage] + index, tests) for engine in engines]
+    return result
+
+
+@cache
+def _spheres(name: str) -> Spheres:
+    return spheres_of(load_item(name).solid)
+
+
+def measure(job: Job) -> dict[str, Any]:
+    """Return the errors of every number of the grid in one capture, or why there is none."""
+    item = load_item(job.object)
+    reason = refusal(job.engine, item.solid)
+    if reason is not None:
+        return {"not_run": reason}
+    try:
+        plan, left_out = plan_capture(item, job.object, job.material, job.task, job.seed, job.tests, job.engine)
+    except NotConvergedError as error:
+        return {"not_run": error.found}
+    tests = [episode for episode in plan.episodes if episode.split == "test"]
+    contact = plan.contact
+    stated = Numbers(contact.natural_time, contact.damping_ratio)
+    errors = {}
+    for numbers in (stated, *(Numbers(*pair) for pair in itertools.product(TIMES_S, RATIOS))):
+        world = true_world(item.solid, _spheres(job.object), contact, plan.fingertip, numbers)
+        found = [pose_errors(world, plan, episode) for episode in tests]
+        errors[f"{numbers.contact_time_s:g} {numbers.damping_ratio:g}"] = np.round(found, 3).tolist()
+    still = [_moved(episode.motion.qpos, plan.frame_rate, episode.frame_count) for episode in tests]
+    return {"stated": f"{stated.contact_time_s:g} {stated.damping_ratio:g}", "errors": errors, "frozen_mm": still,
+            "left_out": left_out}  # fmt: skip
+
+
+def _moved(qpos: Any, rate: float, frames: int) -> float:
+    """Return the mean error [mm] of the prediction that nothing moves."""
+    rows = np.linspace(0, len(qpos) - 1, frames).astype(int)
+    return round(1e3 * float(np.linalg.norm(qpos[rows, :3] - qpos[0, :3], axis=1).mean()), 2)
+
+
+def best_numbers(rows: Sequence[dict[str, Any]]) -> dict[tuple[str, str], str]:
+    """Return the numbers of the grid that predict development captures best, by engine and ground.
+
+    Best is the least mean over captures of the median error, place and orientation each in its unit.
+    """
+    result = {}
+    for engine, material in itertools.product(ENGINES, MATERIALS):
+        chosen = [r for r in rows if (r["engine"], r["material"]) == (engine, material) and "errors" in r]
+        if not chosen:
+            continue
+        grid = [f"{a:g} {b:g}" for a, b in itertools.product(TIMES_S, RATIOS)]
+        scores = [np.mean([_score(row["errors"][key]) for row in chosen]) for key in grid]
+        result[engine, material] = grid[int(np.argmin(scores))]
+    return result
+
+
+def _score(errors: Sequence[Sequence[float]]) -> float:
+    values = np.asarray(errors)
+    return float(np.median(values[:, 0] / UNIT_MM + values[:, 1] / UNIT_DEG))
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the floor by task and engine in Markdown: medians and means over the episodes of the report."""
+    best = best_numbers([row for row in rows if row["stage"] == "dev"])
+    lines = [
+        "| task | engine | captures | stated numbers: mm / deg | best numbers: mm / deg | nothing moves: mm |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    report = [row for row in rows if row["stage"] == "report"]
+    for task, engine in itertools.product(TASKS, (*ENGINES, "all but mujoco")):
+        engines = [one for one in ENGINES if one not in ("mujoco", "mujoco_default")] if " " in engine else [engine]
+        chosen = [row for row in report if row["task"] == task and row["engine"] in engines and "errors" in row]
+        if not chosen:
+            continue
+        stated = np.concatenate([row["errors"][row["stated"]] for row in chosen])
+        tuned = [row["errors"][best[row["engine"], row["material"]]] for row in chosen if _known(best, row)]
+        moved = np.concatenate([row["frozen_mm"] for row in chosen])
+        found = _both(np.concatenate(tuned)) if len(tuned) == len(chosen) else "–"
+        lines.append(f"| {task} | {engine} | {len(chosen)} | {_both(stated)} | {found} | {np.median(moved):.0f} |")
+    lines += ["", "Medians, with means in brackets. Not run:"]
+    reasons = sorted({f"{r['engine']}, {r['task']}, {r['object']}: {r['not_run']}" for r in report if "not_run" in r})
+    return "\n".join((*lines, *(f"- {reason}" for reason in reasons or ["nothing"])))
+
+
+def _known(best: dict[tuple[str, str], str], row: dict[str, Any]) -> bool:
+    return (row["engine"], row["material"]) in best
+
+
+def _both(errors: Any) -> str:
+    middle, mean = np.median(errors, axis=0), np.mean(errors, axis=0)
+    return f"{middle[0]:.1f} / {middle[1]:.1f} ({mean[0]:.1f} / {mean[1]:.1f})"
+
+
+def main() -> int:
+    """Measure what is missing, or print the table of what is stored."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("run", "table"))
+    parser.add_argument("--stage", choices=tuple(FIRST_SEED), default="dev")
+    parser.add_argument("--engines", default=",".join(ENGINES))
+    parser.add_argument("--captures", type=int, default=8, help="of every engine and task")
+    parser.add_argument("--tests", type=int, default=10, help="episodes of a capture")
+    parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
+    parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
+    parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
+    given = parser.parse_args()
+    unknown = [name for name in given.engines.split(",") if name not in ENGINES]
+    if unknown:
+        parser.error(f"--engines: {unknown[0]!r} is none of {', '.join(ENGINES)}")
+    store = Store("engine_floor", given.store, given.any_commit)
+    if given.what == "table":
+        print(table(store.results()))
+        return 0
+    os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
+    wanted = jobs(given.stage, given.engines.split(","), given.captures, given.tests)
+    with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        waiting = {pool.submit(_timed, job): job for job in wanted if store.known(job.key) is None}
+        for done in as_completed(waiting):
+            store.add(waiting[done].key, vars(waiting[done]) | done.result())
+    return 0
+
+
+def _timed(job: Job) -> dict[str, Any]:
+    return timed(lambda: measure(job))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

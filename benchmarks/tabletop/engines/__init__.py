@@ -1,0 +1,49 @@
+"""The engines whose motions are the truth of Fall, Push and Tip; none of them is cgwm's, Bullet or PhysX (held out).
+
+Each has a law of contact of its own. Given are a ground's friction and the restitution of a ball on it; what else an
+engine wants to know is its own, and stands in its module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from cgwm.datasets.synthetic.dynamics import ContactTruth
+from cgwm.datasets.synthetic.objects import SolidObject
+
+from . import dart_engine, drake_engine, mujoco_engine, rapier_engine
+from .stepper import Engine
+
+Maker = Callable[[SolidObject, ContactTruth, bool], Engine]
+"""Makes an engine of an object, its contact, and whether there is a fingertip."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An engine: what makes it, the module that it needs, and whether it takes solids whose parts are no boxes."""
+
+    make: Maker
+    module: str
+    any_solid: bool = True
+
+
+ENGINES: dict[str, Entry] = {
+    "mujoco": Entry(mujoco_engine.Coulomb, "mujoco"),
+    "mujoco_default": Entry(mujoco_engine.Default, "mujoco"),
+    "drake": Entry(drake_engine.Drake, "pydrake"),
+    "dart": Entry(dart_engine.Dart, "dartpy", any_solid=False),
+    "rapier": Entry(rapier_engine.Rapier, "rapier3d"),
+}
+"""By name; `mujoco` is the truth of the older tables."""
+
+
+def refusal(name: str, solid: SolidObject) -> str | None:
+    """Return why an engine cannot simulate a solid, or None where it can."""
+    entry = ENGINES[name]
+    if find_spec(entry.module) is None:
+        return f"{entry.module} is not installed (pip install --no-deps -r benchmarks/requirements.txt)"
+    if not entry.any_solid and not all(dart_engine.is_box(part) for part in solid.parts):
+        return "its collision detector knows no convex parts but boxes"
+    return None
