@@ -14,29 +14,18 @@ import numpy as np
 
 from ..physics.parameters import effect_parameters
 from ..physics.world import World
-from ..segments.candidates import Candidate, admissible, base_parameters, variants_of, without_effect
+from ..segments.candidates import Candidate, admissible, variants_of
 from ..segments.prepare import Prepared
 from ..segments.repeated_forces import RepeatedForce, repeated_force
-from ..segments.residual_wrench import (
-    Omnibus,
-    ResidualWrenches,
-    dispersion,
-    omnibus,
-    residual_wrenches,
-    wrench_windows,
-)
-from ..segments.segment_fit import refit
+from ..segments.residual_wrench import Omnibus, ResidualWrenches, dispersion, wrench_windows
 from ..segments.segments import Segments
 from ..segments.slow_errors import SlowErrors, slow_errors
-from .alternative_laws import OtherLaw, other_laws
-from .coupled_effects import DRAGS
-from .cross_validation import held_out_loss
+from .alternative_laws import OtherLaw
 from .effect_selection import SelectionStep
-from .falsification import Consistency, consistency
-from .flight_search import flight_search, reselected
-from .group_values import with_group_values
-from .lasting_forces import without_lasting
-from .own_tilt import TILTS, own_tilt_step, own_tilts
+from .falsification import Consistency
+from .flight_omnibus import flight_windows, is_significant, worst_omnibus
+from .flight_selection import judged, selected
+from .own_tilt import TILTS, own_tilts
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -200,124 +189,27 @@ def _searched(
     windows = flight_windows(prepared, world)
     scatter = max(prepared.slow, dispersion(*windows[-1])) if windows else 1.0
     before = worst_omnibus(windows, scatter)
-    steps, after_flight, flight = flight_search(prepared, world, candidates, scatter)
-    steps, after_flight, flight = _with_own_tilts(prepared, steps, after_flight, flight, candidates, slow)
-    if flight is not None and slow is not None:
-        needed, after_flight, flight = _with_the_needed(steps, after_flight, flight)
-        if len(needed) < len(steps):  # rivals in the presence of what has gone are none beside what stands
-            common = [step for step in needed if step.flagged and step.own_std is None]
-            own = [step for step in needed if step not in common]
-            found = (after_flight, flight)
-            needed, after_flight, flight = reselected(prepared, common, own, found, candidates, scatter)
-        steps = needed
-    if flight is not None and slow is not None:
-        steps, after_flight, flight = with_group_values(prepared, steps, after_flight, flight, candidates, scatter)
-    prepared, quick = prepared.with_own(after_flight), quick.with_own(after_flight)
-    names = [step.best.name for step in steps if step.flagged and step.own_std is None]
-    others = [] if flight is None else other_laws(flight, after_flight, names, scatter)
-    better = {one.effect for one in others if one.better}
-    fleeting = set() if flight is None else without_lasting(flight, after_flight, names, scatter)
-    better |= fleeting
-    if flight is not None and better and set(names) - better:
-        # the law of this one is another; the others stand without it
-        steps = [step for step in steps if step.best.name not in better]
-        after_flight, flight = _without(flight, after_flight, better)
-        names = [name for name in names if name not in better]
-        others = [one for one in others if one.effect not in better]
-    agreement = None if flight is None else consistency(flight, after_flight, names, prepared.groups, scatter)
-    followed = own_law is not None
-    if flight is not None and slow is not None and agreement is not None and (agreement.doubtful or followed):
-        steps, after_flight, flight = _without_contradicted(prepared, steps, after_flight, flight, scatter, followed)
-        names = [step.best.name for step in steps if step.flagged and step.own_std is None]
-        agreement = consistency(flight, after_flight, names, prepared.groups, scatter)
-        others = [one for one in others if one.effect in names]
-    left, share = _left(quick, world, after_flight, after_flight is not world)
+    found = selected(prepared, world, candidates, scatter, slow)
+    prepared, quick = prepared.with_own(found.world), quick.with_own(found.world)
+    tested = judged(prepared, found, scatter, slow, own_law is not None)
+    found, changed = tested.selection, tested.selection.world is not world
+    left, share = _left(quick, world, found.world, changed)
     return FlightFindings(
         prepared=prepared,
         slow=slow,
         scatter=scatter,
-        steps=tuple(steps),
-        world=after_flight,
-        segments=flight,
+        steps=tuple(found.steps),
+        world=found.world,
+        segments=found.flight,
         before=before,
-        after=worst_omnibus(flight_windows(prepared, after_flight), scatter) if after_flight is not world else before,
-        agreement=agreement,
-        fleeting=tuple(sorted(fleeting & set(names))),
-        others=tuple(others),
+        after=worst_omnibus(flight_windows(prepared, found.world), scatter) if changed else before,
+        agreement=tested.agreement,
+        fleeting=tuple(sorted(tested.fleeting & set(found.names))),
+        others=tuple(one for one in tested.others if one.effect in found.names),
         left=left,
         common_share=share,
         own_law=own_law,
     )
-
-
-def _with_own_tilts(
-    prepared: Prepared,
-    steps: list[SelectionStep],
-    world: World,
-    flight: Segments | None,
-    candidates: Sequence[Candidate],
-    slow: SlowErrors | None,
-) -> tuple[list[SelectionStep], World, Segments | None]:
-    """Return the steps with a tilt of each episode's own, where the slow errors have one, in place of a common one."""
-    if flight is None or slow is None or not slow.sway_evidence:
-        return steps, world, flight
-    names = {step.best.name for step in steps if step.flagged}
-    if "wind" in names and names & set(DRAGS):
-        return steps, world, flight  # a drag in wind pushes a box that turns as if each flight were tilted
-    replaced = {step.best.name for step in steps if step.flagged and step.best.name in TILTS}
-    world, flight = _without(flight, world, replaced)
-    own, world, flight = own_tilt_step(prepared, flight, world, candidates, slow)
-    return [*(step for step in steps if step.flagged and step.best.name not in replaced), own], world, flight
-
-
-def _with_the_needed(
-    steps: list[SelectionStep], world: World, flight: Segments
-) -> tuple[list[SelectionStep], World, Segments]:
-    """Leave out each of several effects without which the others predict held-out flights as well.
-
-    Beside slow errors, whose model is not exact, the fall of BIC alone also takes an effect that adds nothing.
-    """
-    for step in reversed(steps):
-        name = step.best.name
-        names = {one.best.name for one in steps if one.flagged and one.own_std is None}
-        others = names - {name}
-        own = any(one.own_std is not None for one in steps)
-        if name not in names or not (others or own) or ("wind" in others and not others & set(DRAGS)):
-            continue  # wind acts through a drag
-        other, fitted = _without(flight, world, {name})
-        if held_out_loss(fitted, other) < (1 + LIMITS.needed_share) * held_out_loss(flight, world):
-            steps, world, flight = [one for one in steps if one is not step], other, fitted
-    return steps, world, flight
-
-
-def _without_contradicted(
-    prepared: Prepared, steps: list[SelectionStep], world: World, flight: Segments, scatter: float, followed: bool
-) -> tuple[list[SelectionStep], World, Segments]:
-    """Leave out the effects whose parameters differ from episode to episode, where flights do not ask for them.
-
-    Such an effect imitates something else; the others stand where what is left without it does not exceed the noise,
-    or is known to be a force that differs from episode to episode (`followed`).
-    """
-    names = [step.best.name for step in steps if step.flagged and step.own_std is None]
-    alone = {name: consistency(flight, world, [name], prepared.groups, scatter) for name in names}
-    wrong = {name for name, found in alone.items() if found is not None and found.doubtful}
-    kept = [step for step in steps if step.flagged and step.best.name not in wrong]
-    if not wrong or not kept:
-        return steps, world, flight
-    other, fitted = _without(flight, world, wrong)
-    if not followed and is_significant(worst_omnibus(flight_windows(prepared, other), scatter)):
-        return steps, world, flight
-    return kept, other, fitted
-
-
-def _without(flight: Segments, world: World, names: set[str]) -> tuple[World, Segments]:
-    """Return the world without some effects, the others fitted again, and the segments with states fitted by it."""
-    if not names:
-        return world, flight
-    for name in names:
-        world = without_effect(world, name)
-    found = refit([flight], world, base_parameters(world, "flight"))
-    return found.world, found.segments[0]
 
 
 def _left(prepared: Prepared, world: World, after_flight: World, selected: bool) -> tuple[RepeatedForce | None, float]:
@@ -346,20 +238,3 @@ def _wrenches(prepared: Prepared, world: World) -> ResidualWrenches | None:
 def _square(found: ResidualWrenches) -> float:
     """Return chi2 of residual wrenches."""
     return float(np.einsum("ni,nij,nj->", found.wrench, found.information, found.wrench))
-
-
-def flight_windows(prepared: Prepared, world: World) -> list[tuple[Segments, ResidualWrenches]]:
-    """Cut the flights into windows of each length of the omnibus test and estimate their residual wrenches."""
-    cut = [windows for longest_s in LIMITS.omnibus_s if (windows := prepared.pieces(world, longest_s)) is not None]
-    return [(windows, residual_wrenches(windows)) for windows in cut]
-
-
-def worst_omnibus(windows: Sequence[tuple[Segments, ResidualWrenches]], scatter: float) -> Omnibus | None:
-    """Return the omnibus statistic with the smallest p-value over all window lengths; None without flight."""
-    found = [omnibus(wrenches, scatter) for _, wrenches in windows]
-    return min(found, key=lambda one: (one.p_value, -one.statistic), default=None)
-
-
-def is_significant(found: Omnibus | None) -> bool:
-    """Return whether a residual wrench exceeds the noise by both thresholds; False without flight."""
-    return found is not None and found.statistic > LIMITS.omnibus_limit and found.p_value < LIMITS.omnibus_p

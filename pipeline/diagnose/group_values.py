@@ -8,7 +8,7 @@ BIC, and, where each group has several episodes, predicts each from the others o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from ..physics.world import World
 from ..segments.candidates import Candidate, Variant, admissible, base_parameters, variants_of, without_effect
 from ..segments.linearization import Linearization, linearize
 from ..segments.prepare import Prepared
-from ..segments.segment_fit import Refit, refit
+from ..segments.segment_fit import refit
 from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
 from .effect_selection import SelectionStep
@@ -73,6 +73,36 @@ class _Fitted:
         return np.std(list(self.values.values()), axis=0, ddof=1)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Search:
+    """What all fits of effects with a value in each group share."""
+
+    prepared: Prepared
+    """The episodes."""
+    candidates: Sequence[Candidate]
+    """All candidates."""
+    groups: NDArray[np.int64]
+    """Group (B,) of each flight."""
+    scatter: float
+    """Factor by which variances exceed those of the noise."""
+    penalty: float
+    """BIC's penalty of one parameter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Place:
+    """A place for an effect with a value in each group."""
+
+    replaces: str | None
+    """The selected effect whose place it is; None for one beside all of them."""
+    world: World
+    """The world with the other selected effects."""
+    flight: Segments
+    """Flights with states fitted by that world."""
+    beside: int
+    """Number of parameters of the other selected effects."""
+
+
 def with_group_values(
     prepared: Prepared,
     steps: list[SelectionStep],
@@ -94,45 +124,66 @@ def with_group_values(
     groups = _groups(prepared, flight)
     if len(np.unique(groups)) < 2 or any(parameter.shared == "group" for parameter in effect_parameters(world)):
         return steps, world, flight
-    count = math.log(max(float(flight.dof.sum()), 2.0))
-    named = [step.best.name for step in steps if step.flagged and step.own_std is None]
-    before = _cost(refit([flight], world, []), scatter) + count * sum(
-        len(step.best.candidate.effect.parameters) for step in steps if step.best.name in named
-    )
-    found: list[_Fitted] = []
-    for name in (None, *named):
-        bare = world if name is None else without_effect(world, name)
-        if len(bare.effects) < len(world.effects) - 1:
-            continue  # another effect acts through this one
-        states = flight if name is None else fit_states(flight.in_world(bare))
-        others = [step for step in steps if step.best.name in named and step.best.name != name]
-        penalty = count * sum(len(step.best.candidate.effect.parameters) for step in others)
-        found += _fits(prepared, groups, bare, states, candidates, (scatter, count, penalty), name)
-    best = min(found, key=lambda one: one.cost, default=None)
-    if best is None or best.cost - min(before, best.alone) > LIMITS.slight_bic:
+    penalty = math.log(max(float(flight.dof.sum()), 2.0))
+    search = _Search(prepared=prepared, candidates=candidates, groups=groups, scatter=scatter, penalty=penalty)
+    sizes = {
+        step.best.name: len(step.best.candidate.effect.parameters)
+        for step in steps
+        if step.flagged and step.own_std is None
+    }
+    before = refit([flight], world, []).cost / scatter + penalty * sum(sizes.values())
+    equals = _likeliest([one for place in _places(world, flight, sizes) for one in _fits(search, place)], before)
+    if not equals:
         return steps, world, flight
-    episode = np.array([item.episode for item in flight.items])
-    helping = [one for one in found if one is not best and one.cost < before]
-    equals = [best, *(one for one in helping if _unproven(best, one, episode))]
-    gain = before - best.cost
-    evidence = tuple(_evidence(one, gain - (one.cost - best.cost), count) for one in equals)
+    best = equals[0]
+    evidence = tuple(_evidence(one, before - best.cost - (one.cost - best.cost), penalty) for one in equals)
     step = SelectionStep(evidence, evidence, True, own_std=float(best.spread[0]))
     kept = [one for one in steps if one.flagged and one.best.name != best.replaces]
     return [*kept, step], *_placed(prepared, best, groups)
 
 
-def _unproven(best: _Fitted, other: _Fitted, episode: NDArray[np.int64]) -> bool:
+def _likeliest(found: Sequence[_Fitted], before: float) -> list[_Fitted]:
+    """Return the likeliest effect and those that flights do not tell from it; none where it explains too little.
+
+    Args:
+        found: The effects.
+        before: The cost with the selected effects alone.
+    """
+    best = min(found, key=lambda one: one.cost, default=None)
+    if best is None or best.cost - min(before, best.alone) > LIMITS.slight_bic:
+        return []
+    helping = [one for one in found if one is not best and one.cost < before]
+    return [best, *(one for one in helping if _unproven(best, one))]
+
+
+def _places(world: World, flight: Segments, sizes: Mapping[str, int]) -> Iterator[_Place]:
+    """Yield the place beside all selected effects, and that of each through which no other one acts.
+
+    Args:
+        world: The world with the selected effects.
+        flight: Flights with states fitted by it.
+        sizes: Number of parameters of each selected effect, by name.
+    """
+    yield _Place(replaces=None, world=world, flight=flight, beside=sum(sizes.values()))
+    for name in sizes:
+        bare = without_effect(world, name)
+        if len(bare.effects) == len(world.effects) - 1:
+            beside = sum(sizes.values()) - sizes[name]
+            yield _Place(replaces=name, world=bare, flight=fit_states(flight.in_world(bare)), beside=beside)
+
+
+def _unproven(best: _Fitted, other: _Fitted) -> bool:
     """Return whether another effect in the same place is not worse in most episodes: a paired t-test, as for one value.
 
     Args:
         best: The likeliest effect.
         other: The other one.
-        episode: Episode of each flight (B,).
     """
     if other.replaces != best.replaces:
         return False
     if other.cost - best.cost < LIMITS.alias_chi2:
         return True
+    episode = np.array([item.episode for item in best.flight.items])
     worse = np.array([(other.by_flight - best.by_flight)[episode == one].sum() for one in np.unique(episode)])
     return float(worse.mean()) <= LIMITS.paired_t * float(worse.std(ddof=1)) / math.sqrt(len(worse))
 
@@ -142,73 +193,66 @@ def _groups(prepared: Prepared, flight: Segments) -> NDArray[np.int64]:
     return np.array([prepared.groups[item.episode] for item in flight.items])
 
 
-def _cost(found: Refit, scatter: float) -> float:
-    """Return chi2 in units of the scatter."""
-    return found.cost / scatter
-
-
-def _fits(
-    prepared: Prepared,
-    groups: NDArray[np.int64],
-    world: World,
-    flight: Segments,
-    candidates: Sequence[Candidate],
-    scale: tuple[float, float, float],
-    replaces: str | None,
-) -> list[_Fitted]:
-    """Return the likeliest effects with a value in each group, refitted.
-
-    Args:
-        prepared: The episodes.
-        groups: Group of each flight.
-        world: The world without them.
-        flight: Flights with states fitted by it.
-        candidates: All candidates.
-        scale: The scatter, BIC's penalty of one parameter, and of the effects that the world was given.
-        replaces: The selected effect in whose place they are.
-    """
-    scatter, count, penalty = scale
+def _fits(search: _Search, place: _Place) -> list[_Fitted]:
+    """Return the likeliest effects with a value in each group in a place, refitted."""
+    world, flight = place.world, place.flight
     spun = flight.observations.spin_rad_s is not None
-    kept = [one for one in admissible(world, candidates, prepared.has_orientation, spun)[0] if _suits(one)]
+    kept, _ = admissible(world, search.candidates, search.prepared.has_orientation, spun)
+    kept = [candidate for candidate in kept if _suits(candidate)]
     variants = variants_of(kept, world.gravity[0, :1])
     if not variants:
         return []
-    linear = linearize(flight, world, variants, prepared.groups, robust=False)
-    scored = []
-    for variant in variants:
-        columns = linear.columns(variant.parameters)
-        start = {group: _solved(linear, columns, groups == group) for group in np.unique(groups).tolist()}
-        gain = sum(one[1] for one in start.values()) / scatter - count * len(columns) * len(start)
-        if gain > 0 and _predicts(linear, columns, groups):
-            scored.append((gain, variant, {group: one[0] for group, one in start.items()}))
-    scored.sort(key=lambda one: (-one[0], one[1].place))
-    found = []
-    for _, variant, start in _unlike(linear, scored)[:REFITTED]:
-        values, by_flight, alone = _refitted(kept[variant.place], world, flight, groups, start)
-        size = len(variant.parameters)
-        found.append(
-            _Fitted(
-                candidate=kept[variant.place],
-                replaces=replaces,
-                world=world,
-                flight=flight,
-                values=values,
-                cost=float(by_flight.sum()) / scatter + penalty + count * size * len(values),
-                by_flight=by_flight,
-                alone=alone / scatter + penalty + count * size,
-            )
-        )
-    return found
+    linear = linearize(flight, world, variants, search.prepared.groups, robust=False)
+    scored = [one for variant in variants if (one := _scored(search, linear, variant)) is not None]
+    scored.sort(key=lambda one: (-one.gain, one.variant.place))
+    likeliest = _unlike(linear, scored)[:REFITTED]
+    return [_fitted(search, place, kept[one.variant.place], one.values) for one in likeliest]
 
 
-def _unlike(
-    linear: Linearization, scored: Sequence[tuple[float, Variant, dict[int, Array]]]
-) -> list[tuple[float, Variant, dict[int, Array]]]:
-    """Return the variants without those that do the same as one before them."""
-    found: list[tuple[float, Variant, dict[int, Array]]] = []
+@dataclass(frozen=True, kw_only=True)
+class _Scored:
+    """An effect with a value in each group, estimated by one step from neutral."""
+
+    gain: float
+    """Fall of chi2 in units of the scatter, less BIC's penalty for the parameters."""
+    variant: Variant
+    """The effect with its constants."""
+    values: dict[int, Array]
+    """Parameters (k,) by group."""
+
+
+def _scored(search: _Search, linear: Linearization, variant: Variant) -> _Scored | None:
+    """Return an effect with a value in each group; None where that explains or predicts too little."""
+    columns = linear.columns(variant.parameters)
+    by_group = {one: _solved(linear, columns, search.groups == one) for one in np.unique(search.groups).tolist()}
+    gain = sum(fall for _, fall in by_group.values()) / search.scatter - search.penalty * len(columns) * len(by_group)
+    if gain <= 0 or not _predicts(linear, columns, search.groups):
+        return None
+    return _Scored(gain=gain, variant=variant, values={one: value for one, (value, _) in by_group.items()})
+
+
+def _fitted(search: _Search, place: _Place, candidate: Candidate, start: dict[int, Array]) -> _Fitted:
+    """Return an effect refitted to the flights of each group, and to all of them."""
+    values, by_flight, alone = _refitted(candidate, place.world, place.flight, search.groups, start)
+    beside, own = search.penalty * place.beside, search.penalty * len(candidate.effect.parameters)
+    return _Fitted(
+        candidate=candidate,
+        replaces=place.replaces,
+        world=place.world,
+        flight=place.flight,
+        values=values,
+        cost=float(by_flight.sum()) / search.scatter + beside + own * len(values),
+        by_flight=by_flight,
+        alone=alone / search.scatter + beside + own,
+    )
+
+
+def _unlike(linear: Linearization, scored: Sequence[_Scored]) -> list[_Scored]:
+    """Return the effects without those that do the same as one before them."""
+    found: list[_Scored] = []
     for one in scored:
-        columns = [linear.columns(other[1].parameters) for other in found]
-        mine = linear.columns(one[1].parameters)
+        columns = [linear.columns(other.variant.parameters) for other in found]
+        mine = linear.columns(one.variant.parameters)
         if all(canonical_correlation(linear, mine, other) < LIMITS.contained for other in columns):
             found.append(one)
     return found

@@ -18,7 +18,8 @@ from .cross_validation import held_out_errors, held_out_fall
 from .detection_limits import DetectionLimit
 from .effect_selection import SelectionStep
 from .evidence import Evidence
-from .flight_findings import FlightFindings, flight_findings, is_significant
+from .flight_findings import FlightFindings, flight_findings
+from .flight_omnibus import is_significant
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict

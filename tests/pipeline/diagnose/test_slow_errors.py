@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.diagnose import flight_findings
-from cgwm.pipeline.diagnose.effect_selection import SelectionStep, _with_unproven, select_next
+from cgwm.pipeline.diagnose import flight_selection
+from cgwm.pipeline.diagnose.effect_selection import _with_unproven, select_next
 from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.flight_findings import _searched, _without
+from cgwm.pipeline.diagnose.flight_findings import _searched
+from cgwm.pipeline.diagnose.flight_selection import FlightSelection
 from cgwm.pipeline.diagnose.own_accelerations import OwnAccelerations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.pictures import effect_picture
 from cgwm.pipeline.diagnose.remaining import remaining_of
@@ -25,7 +26,6 @@ from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.prepare import Prepared, prepare, whole_flights
 from cgwm.pipeline.segments.repeated_forces import RepeatedForce, repeated_force  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.segments.residual_wrench import Omnibus, ResidualWrenches
-from cgwm.pipeline.segments.segments import Segments
 from cgwm.pipeline.segments.slow_errors import SlowErrors, moving  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, NoiseModel, axis_innovations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.trajectories.segmentation import Segment
@@ -139,11 +139,11 @@ def test_rivals_in_the_presence_of_an_effect_that_has_gone_are_none(monkeypatch:
         steps[-1] = replace(steps[-1], equals=(steps[-1].best, replace(steps[-1].best, candidate=other)))
         return steps, world, flight
 
-    def the_last(steps: list[SelectionStep], world: World, flight: Segments):
-        return steps[1:], *_without(flight, world, {"quadratic_drag"})
+    def the_last(found: FlightSelection) -> FlightSelection:
+        return found.without({"quadratic_drag"})
 
-    monkeypatch.setattr(flight_findings, "flight_search", both)
-    monkeypatch.setattr(flight_findings, "_with_the_needed", the_last)
+    monkeypatch.setattr(flight_selection, "flight_search", both)
+    monkeypatch.setattr(flight_selection, "_with_the_needed", the_last)
     flying = tosses(world_with("ball", {"linear_drag": {"c": 0.3}}, False), 2, count=4, duration_s=0.6)
     world = world_with("ball", ground=False)
     errors = NoiseModel(position=CorrelatedNoise(share=0.5, time_s=0.02, slow=1.0, slow_time_s=0.2))

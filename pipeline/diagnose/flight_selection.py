@@ -1,0 +1,193 @@
+"""Selection of effects in flight: the search, its revision beside slow errors, and tests of the laws that it found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from ..physics.world import World
+from ..segments.candidates import Candidate, base_parameters, without_effect
+from ..segments.prepare import Prepared
+from ..segments.segment_fit import refit
+from ..segments.segments import Segments
+from ..segments.slow_errors import SlowErrors
+from .alternative_laws import OtherLaw, other_laws
+from .coupled_effects import DRAGS
+from .cross_validation import held_out_loss
+from .effect_selection import SelectionStep
+from .falsification import Consistency, consistency
+from .flight_omnibus import flight_windows, is_significant, worst_omnibus
+from .flight_search import flight_search, reselected
+from .group_values import with_group_values
+from .lasting_forces import without_lasting
+from .own_tilt import TILTS, own_tilt_step
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.verdict
+
+
+class FlightSelection(NamedTuple):
+    """The effects selected in flight."""
+
+    steps: list[SelectionStep]
+    """The selection steps; without a selected effect the one step that selected none."""
+    world: World
+    """The world with the selected effects."""
+    flight: Segments | None
+    """Flight segments with states fitted by it; None without flight."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the selected effects with one value for all episodes."""
+        return [step.best.name for step in self.steps if step.flagged and step.own_std is None]
+
+    def without(self, names: set[str]) -> FlightSelection:
+        """Leave out some effects, and fit the others again."""
+        if self.flight is None:
+            return self
+        world, flight = _without(self.flight, self.world, names)
+        return FlightSelection([step for step in self.steps if step.best.name not in names], world, flight)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedSelection:
+    """What is left of a selection after tests of the laws of its effects, and the results of these tests."""
+
+    selection: FlightSelection
+    """The effects that are left."""
+    others: Sequence[OtherLaw] = ()
+    """Alternative laws of the effects."""
+    fleeting: frozenset[str] = frozenset()
+    """The constant forces that do not act as much late in the flights as early."""
+    agreement: Consistency | None = None
+    """Whether the effects have the same parameters in all episodes; None without effects."""
+
+
+def selected(
+    prepared: Prepared, world: World, candidates: Sequence[Candidate], scatter: float, slow: SlowErrors | None
+) -> FlightSelection:
+    """Select effects with one value for all episodes; beside slow errors also with one for each episode or group."""
+    found = FlightSelection(*flight_search(prepared, world, candidates, scatter))
+    if found.flight is None or slow is None:
+        return found
+    found = _with_own_tilts(prepared, found, candidates, slow)
+    found = _reselected(prepared, found, _with_the_needed(found), candidates, scatter)
+    if found.flight is None:
+        return found
+    grouped = with_group_values(prepared, found.steps, found.world, found.flight, candidates, scatter)
+    return FlightSelection(*grouped)
+
+
+def _reselected(
+    prepared: Prepared, found: FlightSelection, needed: FlightSelection, candidates: Sequence[Candidate], scatter: float
+) -> FlightSelection:
+    """Select the needed effects again where others have gone: rivals in the presence of what has gone are none."""
+    if needed.flight is None or len(needed.steps) == len(found.steps):
+        return needed
+    common = [step for step in needed.steps if step.flagged and step.own_std is None]
+    own = [step for step in needed.steps if step not in common]
+    return FlightSelection(*reselected(prepared, common, own, (needed.world, needed.flight), candidates, scatter))
+
+
+def judged(
+    prepared: Prepared, found: FlightSelection, scatter: float, slow: SlowErrors | None, followed: bool
+) -> JudgedSelection:
+    """Leave out the effects whose law is another one, and beside slow errors those that episodes contradict.
+
+    Args:
+        prepared: The episodes.
+        found: The selected effects.
+        scatter: Factor by which variances exceed those of the noise.
+        slow: The slow errors.
+        followed: Whether what is left is known to be a force that differs from episode to episode.
+    """
+    if found.flight is None:
+        return JudgedSelection(selection=found)
+    others = other_laws(found.flight, found.world, found.names, scatter)
+    fleeting = frozenset(without_lasting(found.flight, found.world, found.names, scatter))
+    wrong = {one.effect for one in others if one.better} | fleeting
+    if wrong and set(found.names) - wrong:
+        found = found.without(wrong)
+    agreement = _agreement(prepared, found, found.names, scatter)
+    if slow is not None and agreement is not None and (agreement.doubtful or followed):
+        found = _without_contradicted(prepared, found, scatter, followed)
+        agreement = _agreement(prepared, found, found.names, scatter)
+    return JudgedSelection(selection=found, others=others, fleeting=fleeting, agreement=agreement)
+
+
+def _agreement(prepared: Prepared, found: FlightSelection, names: Sequence[str], scatter: float) -> Consistency | None:
+    """Return whether effects have the same parameters in all episodes; None without effects or flight."""
+    if found.flight is None:
+        return None
+    return consistency(found.flight, found.world, names, prepared.groups, scatter)
+
+
+def _with_own_tilts(
+    prepared: Prepared, found: FlightSelection, candidates: Sequence[Candidate], slow: SlowErrors
+) -> FlightSelection:
+    """Select a tilt of each episode's own, where the slow errors have one, in place of a common one."""
+    names = {step.best.name for step in found.steps if step.flagged}
+    if not slow.sway_evidence or ("wind" in names and names & set(DRAGS)):
+        return found  # a drag in wind pushes a box that turns as if each flight were tilted
+    level = found.without(names & set(TILTS))
+    if level.flight is None:
+        return found
+    own, world, flight = own_tilt_step(prepared, level.flight, level.world, candidates, slow)
+    return FlightSelection([*(step for step in level.steps if step.flagged), own], world, flight)
+
+
+def _with_the_needed(found: FlightSelection) -> FlightSelection:
+    """Leave out each of several effects without which the others predict held-out flights as well.
+
+    Beside slow errors, whose model is not exact, the fall of BIC alone also takes an effect that adds nothing.
+    """
+    for step in reversed(found.steps):
+        name = step.best.name
+        if name in found.names and not _alone_or_carrying(found, name):
+            found = _unless_needed(found, name)
+    return found
+
+
+def _alone_or_carrying(found: FlightSelection, name: str) -> bool:
+    """Return whether no effect is left without one, or only such as act through it: wind acts through a drag."""
+    others = set(found.names) - {name}
+    own = any(step.own_std is not None for step in found.steps)
+    return not (others or own) or ("wind" in others and not others & set(DRAGS))
+
+
+def _unless_needed(found: FlightSelection, name: str) -> FlightSelection:
+    """Leave out an effect without which the others predict held-out flights as well."""
+    other = found.without({name})
+    if found.flight is None or other.flight is None:
+        return found
+    limit = (1 + LIMITS.needed_share) * held_out_loss(found.flight, found.world)
+    return other if held_out_loss(other.flight, other.world) < limit else found
+
+
+def _without_contradicted(
+    prepared: Prepared, found: FlightSelection, scatter: float, followed: bool
+) -> FlightSelection:
+    """Leave out the effects whose parameters differ from episode to episode, where flights do not ask for them.
+
+    Such an effect imitates something else; the others stand where what is left without it does not exceed the noise,
+    or is known to be a force that differs from episode to episode (`followed`).
+    """
+    alone = {name: _agreement(prepared, found, [name], scatter) for name in found.names}
+    wrong = {name for name, agreement in alone.items() if agreement is not None and agreement.doubtful}
+    if not wrong or not any(step.flagged and step.best.name not in wrong for step in found.steps):
+        return found
+    other = found.without(wrong)
+    if not followed and is_significant(worst_omnibus(flight_windows(prepared, other.world), scatter)):
+        return found
+    return other._replace(steps=[step for step in other.steps if step.flagged])
+
+
+def _without(flight: Segments, world: World, names: set[str]) -> tuple[World, Segments]:
+    """Return the world without some effects, the others fitted again, and the segments with states fitted by it."""
+    if not names:
+        return world, flight
+    for name in names:
+        world = without_effect(world, name)
+    found = refit([flight], world, base_parameters(world, "flight"))
+    return found.world, found.segments[0]
