@@ -22,6 +22,9 @@ class ImageVerdict(FileModel):
     """Verified matches with all of them together."""
     inliers: int = 0
     """Features that see a sparse point of the model."""
+    center_std_percent: float | None = None
+    """Standard deviation of the optical centre [% of the diagonal of the box around all centres], at most 100; none for
+    an image that is not registered."""
 
 
 class PairFigures(FileModel):
@@ -84,6 +87,8 @@ class CalibrationReport(FileModel):
     """Mean over the points. A wrong model can have a low one: the self-check decides."""
     self_check: SelfCheckFigures
     attempts: tuple[CalibrationAttempt, ...]
+    center_std_percent: float | None = None
+    """Median over the registered images of the standard deviation of the optical centre [% of the centres' extent]."""
     scale: Scale
     world_frame: str
     """Where the axes and the origin come from, in words."""
@@ -108,6 +113,7 @@ class CalibrationReport(FileModel):
             f"{self.points} points, reprojection {self.reprojection_error_px:.2f} px, {self.wall_time_s:.0f} s",
             f"self-check: {_passed(self.self_check)}",
             *(f"camera model: {one.camera_model}" for one in self.attempts if one.outcome == "taken"),
+            *self._centers(),
         ]
         if self.videos:
             seen = sum(verdict.registered for verdict in self.videos.values())
@@ -122,6 +128,18 @@ class CalibrationReport(FileModel):
             if not verdict.registered:
                 lines.append(f"not registered: {name}: {verdict.reason}")
         return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
+
+    def _centers(self) -> list[str]:
+        """Return the line on how certain the optical centres are."""
+        seen = {name: verdict.center_std_percent for name, verdict in {**self.images, **self.videos}.items()}
+        known = {name: value for name, value in seen.items() if value is not None}
+        if not known or self.center_std_percent is None:
+            return []
+        worst = max(known, key=lambda name: known[name])
+        return [
+            f"optical centres: +- {self.center_std_percent:.2g} % of their extent (median), "
+            f"+- {known[worst]:.2g} % at {worst}"
+        ]
 
 
 def _passed(check: SelfCheckFigures) -> str:

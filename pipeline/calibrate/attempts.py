@@ -148,7 +148,7 @@ def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[SfmModel], 
     best: list[Mapped] = []
     start = ""
     for model in FIRST_TRIED:
-        models = _limited(model, inputs)
+        models = limited(model, inputs)
         mapped = map_database(database, inputs.root, seed, models, inputs.known)
         if mapped and (not best or mapped[0].image_count > best[0].image_count):
             best, start = mapped, model
@@ -157,7 +157,7 @@ def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[SfmModel], 
     if not best:
         return [], ""
     steps = [
-        (model, adjusted(best[0], _limited(model, inputs), inputs.known, seed))
+        (model, adjusted(best[0], limited(model, inputs), inputs.known, seed))
         for model in richer(start, "SIMPLE_PINHOLE" if _all_known(inputs) else "OPENCV")
     ]
     free = len(set(best[0].names.values()) - set(inputs.known))
@@ -166,7 +166,7 @@ def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[SfmModel], 
     return [largest.model(), *(one.model() for one in best[1:])], taken
 
 
-def _limited(model: str, inputs: Inputs) -> dict[str, str]:
+def limited(model: str, inputs: Inputs) -> dict[str, str]:
     """Return a camera model by camera, no richer than the camera's photos allow."""
     return {camera: min(model, richest, key=LADDER.index) for camera, richest in inputs.richest.items()}
 

@@ -54,7 +54,7 @@ class SfmCamera:
         target = (np.asarray(xy_px, float).reshape(-1, 2) - [self.cx, self.cy]) / [self.fx, self.fy]
         rays = target.copy()
         for _ in range(_UNDISTORT_STEPS):  # Newton; the lens maps of real photos are close to the identity
-            value, jacobian = _distort(rays, self.distortion)
+            value, jacobian = distort(rays, self.distortion)
             step = np.linalg.solve(jacobian, (value - target)[:, :, None])[:, :, 0]
             rays -= step
             if np.max(np.abs(step), initial=0.0) < 1e-14:
@@ -71,7 +71,7 @@ class SfmCamera:
             Pixels [px], shape (point, 2).
         """
         rays = points_cam[:, :2] / points_cam[:, 2:]
-        return _distort(rays, self.distortion)[0] * [self.fx, self.fy] + [self.cx, self.cy]
+        return distort(rays, self.distortion)[0] * [self.fx, self.fy] + [self.cx, self.cy]
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def world_from_cam(T_cam_world: Array) -> Array:
     return inverse
 
 
-def _distort(rays: Array, distortion: tuple[float, float, float, float]) -> tuple[Array, Array]:
+def distort(rays: Array, distortion: tuple[float, float, float, float]) -> tuple[Array, Array]:
     """Apply OpenCV's lens model to ray slopes (ray, 2); return them and the Jacobians (ray, 2, 2).
 
     Source: OpenCV, "Camera Calibration and 3D Reconstruction", k1 k2 p1 p2.

@@ -35,7 +35,8 @@ from ...schemas import (
 from ...schemas.calibration import CalibrationAttempt, CalibrationReport, ImageVerdict
 from ..runtime.work_budget import Part, within_budget
 from . import colmap
-from .attempts import MIN_PHOTOS, Candidate, check_figures, photo_count, photo_labels, search, verdict
+from .attempts import MIN_PHOTOS, Candidate, check_figures, limited, photo_count, photo_labels, search, verdict
+from .center_uncertainty import center_stds
 from .markers import detect_markers, dictionary
 from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
 from .photos import Inputs, gather, video_label
@@ -48,6 +49,8 @@ REPORT_NAME = "calibration.json"
 _TEMPORARY = "the photos and COLMAP's database"
 _FEATURE_BYTES = 76
 """Lower bound of a feature in the database [bytes]: half of its descriptor and place."""
+UNCERTAIN_CENTER = 0.005
+"""Standard deviation of an optical centre, as a fraction of the extent of all, above which a warning is given."""
 _MANY_WITHOUT_STRONG = 0.5
 """Share of registered images without a pair of many verified matches above which a warning is given."""
 
@@ -239,7 +242,11 @@ def _report(
     scale: Scale,
     world_frame: str,
 ) -> CalibrationReport:
-    verdicts = {source.label: verdict(source.label, best) for source in inputs.sources}
+    stds = _center_stds_percent(best, inputs)
+    verdicts = {
+        source.label: verdict(source.label, best).model_copy(update={"center_std_percent": stds.get(source.label)})
+        for source in inputs.sources
+    }
     photos = photo_labels(inputs)
     videos = {
         label.removeprefix(video_label("")): verdict for label, verdict in verdicts.items() if label not in photos
@@ -255,15 +262,36 @@ def _report(
         reprojection_error_px=model.reprojection_error_px,
         self_check=check_figures(best.check),
         attempts=tuple(attempts),
+        center_std_percent=round(float(np.median(list(stds.values()))), 4),
         scale=scale,
         world_frame=world_frame,
         ground_tilt_deg=tilt,
         ground_height_m=height,
-        warnings=(*inputs.notes, *_warnings(best)),
+        warnings=(*inputs.notes, *_warnings(best), *_uncertain_centers(stds)),
         config=config,
         versions=colmap.versions(),
         wall_time_s=0.0,
     )
+
+
+def _center_stds_percent(best: Candidate, inputs: Inputs) -> dict[str, float]:
+    """Return the standard deviation of each optical centre [% of their extent], at most 100."""
+    used = set(best.model.image_camera.values()) - set(inputs.known)
+    models = {camera: model for camera, model in limited(best.camera_model, inputs).items() if camera in used}
+    return {image: round(min(100.0 * std, 100.0), 4) for image, std in center_stds(best.model, models).items()}
+
+
+def _uncertain_centers(stds_percent: dict[str, float]) -> list[str]:
+    uncertain = [image for image, std in stds_percent.items() if std > 100.0 * UNCERTAIN_CENTER]
+    if not uncertain:
+        return []
+    worst = max(uncertain, key=lambda image: stds_percent[image])
+    return [
+        f"the optical centres of {len(uncertain)} of {len(stds_percent)} registered images are less certain than "
+        f"{100.0 * UNCERTAIN_CENTER:g} % of their extent ({worst}: {stds_percent[worst]:.1f} %): few matches tie them "
+        "to the others, or the lens is long; more photos between them, surroundings with texture or known intrinsics "
+        "([[calibration.intrinsics]]) make them certain"
+    ]
 
 
 def _warnings(best: Candidate) -> list[str]:

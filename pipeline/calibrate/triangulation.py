@@ -92,9 +92,9 @@ def center_std(model: SfmModel, image: str, direction: Array, noise_px: float) -
     pose = model.T_cam_world[image]
     points = model.points[model.observations[image][1]]
     local = points @ pose[:3, :3].T + pose[:3, 3]
-    projection = _projection_jacobian(local) * model.camera(image).focal_px
+    projection = projection_jacobian(local) * model.camera(image).focal_px
     # x_cam = R (p - c): moving the centre shifts it by -R dc, turning the camera by w shifts it by w x x_cam.
-    turn = -_cross_matrices(local)
+    turn = -cross_matrices(local)
     jacobian = np.concatenate([projection @ -pose[:3, :3], projection @ turn], axis=2).reshape(-1, 6)
     covariance = noise_px**2 * np.linalg.pinv(jacobian.T @ jacobian)[:3, :3]
     return float(np.sqrt(direction @ covariance @ direction))
@@ -162,18 +162,19 @@ def _errors(points: Array, poses: Array, rays: Array, focal: Array) -> Array:
 def _residual(point: Array, poses: Array, rays: Array, focal: Array) -> tuple[Array, Array]:
     local = poses[:, :3, :3] @ point + poses[:, :3, 3]
     residual = (local[:, :2] / local[:, 2:] - rays) * focal[:, None]
-    jacobian = _projection_jacobian(local) @ poses[:, :3, :3] * focal[:, None, None]
+    jacobian = projection_jacobian(local) @ poses[:, :3, :3] * focal[:, None, None]
     return residual.ravel(), jacobian.reshape(-1, 3)
 
 
-def _projection_jacobian(local: Array) -> Array:
+def projection_jacobian(local: Array) -> Array:
     """Return d(x/z, y/z)/d(x, y, z), shape (point, 2, 3)."""
     x, y, z = local.T
     zero = np.zeros_like(z)
     return np.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], axis=1).reshape(-1, 2, 3)
 
 
-def _cross_matrices(vectors: Array) -> NDArray[np.float64]:
+def cross_matrices(vectors: Array) -> NDArray[np.float64]:
+    """Return the matrices that multiply by vectors (point, 3) from the left, shape (point, 3, 3)."""
     x, y, z = vectors.T
     zero = np.zeros_like(z)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
