@@ -80,9 +80,9 @@ def contact_phases(contact: Segments) -> list[list[PhaseName]]:
                 names.append("impact")
             elif float(speeds[item, k]) < float(limit):
                 names.append("rest")
-            elif float(slides[item, k]) > 0.5 * impulse:
+            elif float(slides[item, k]) > LIMITS.sliding_impulse * impulse:
                 names.append("sliding")
-            elif float(round_share[item, k]) > 0.5 and float(turning[item, k]) > 0:
+            elif float(round_share[item, k]) > LIMITS.rolling_impulse and float(turning[item, k]) > 0:
                 names.append("rolling")
             else:
                 names.append("sticking")

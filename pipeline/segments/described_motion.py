@@ -154,13 +154,12 @@ class _Predicted:
         nearest = float(torch.where(measured, gap, torch.inf).amin(1).median())
         if nearest == np.inf:
             return "the model has nothing to touch: no ground, and no other body. Add [world] ground to capture.toml"
-        near = 0.1 * self.size_m
-        if nearest > near:
+        if nearest > LIMITS.near_sizes * self.size_m:
             return (
                 f"the measured body stays {1e3 * nearest:.0f} mm away from all that it could touch: the ground lies "
                 "too low, a shape is too small, or the units are wrong"
             )
-        if nearest < -2 * near:
+        if nearest < -LIMITS.inside_sizes * self.size_m:
             return (
                 f"the measured body lies {-1e3 * nearest:.0f} mm inside of what it touches: the ground lies too high, "
                 "a shape is too large, or the units are wrong"

@@ -107,7 +107,7 @@ def _on_a_tilted_plane(gap: Tensor, place: Tensor, normal: Tensor, most: float) 
         plane = torch.linalg.lstsq(weight[:, None] * columns[under], weight * gap[under], driver="gelsd").solution
     left = gap - columns @ plane
     level = float(plane[:3].norm()) <= LIMITS.most_tilt and abs(float(plane[3])) <= most
-    return level and float(torch.quantile(left, 0.05)) >= -most
+    return level and float(torch.quantile(left, LIMITS.deep_share)) >= -most
 
 
 def check_observability(world: World, prepared: Prepared, where: str) -> None:

@@ -38,6 +38,9 @@ class InputThresholds:
         "as `most_tilt`",
         "see `most_tilt`",
     )
+    deep_share: float = threshold(
+        0.05, "1", "share of the frames that may lie deeper under the tilted plane", "as `most_tilt`", "see `most_tilt`"
+    )
     most_carried: float = threshold(
         0.2, "1", "share of the frames above the ground and not falling: shape or ground are wrong"
     )
@@ -141,6 +144,12 @@ class PhaseThresholds:
         "sizes",
         "radius of the touching sphere from which a body rolls",
         "by argument: a cube sticks on its corner",
+    )
+    sliding_impulse: float = threshold(
+        0.5, "1", "share of the normal impulse at contacts that slide from which the body slides", "by argument: half"
+    )
+    rolling_impulse: float = threshold(
+        0.5, "1", "share of the normal impulse on round spheres from which the body rolls", "by argument: half"
     )
 
 
@@ -261,6 +270,10 @@ class DescribedThresholds:
         0.3, "1", "change of height that is none, as a share of that of free fall about its highest point", BY_ARGUMENT
     )
     turn_m_s: float = threshold(0.2, "m/s", "speed from falling to rising within three frames: a bounce", BY_ARGUMENT)
+    near_sizes: float = threshold(
+        0.1, "sizes", "distance to what could be touched from which shape or ground are named as the cause", BY_ARGUMENT
+    )
+    inside_sizes: float = threshold(0.2, "sizes", "the same inside of it", BY_ARGUMENT)
 
 
 @dataclass(frozen=True, kw_only=True)
