@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..geometry.rotation import cross
 from ..optimization.forward_mode import parts_of
+from .edge_contact import Crossings, Edges, best_normal, slots_of
 from .fixed_surface import HALF_SPACE
 from .hull import MOST_PLANES, Hull, hull_distance, parallel_face, parting
 from .smooth_distance import blended, log_sum_exp_distance, smooth_min
@@ -25,6 +26,8 @@ PAIR_SMOOTHING_M = 1e-3
 """Width of the smooth minimum in the distance between two bodies [m]."""
 ROUNDING_M = 1e-9
 """Margin of the broad phase [m], for rounding: distances are computed again afterwards, in another order."""
+FAR_M = 1e3
+"""Gap of a slot in which nothing meets [m]; its normal is z, its position the origin."""
 GROUND = -1
 """Index of the ground as the second body of a pair; fixed surfaces follow, -2 being the first."""
 
@@ -122,7 +125,16 @@ def slot_count(world: World, pair: tuple[int, int]) -> int:
         return first.radii.shape[-1] * surface.contacts_per_sphere
     if plane:
         return first.radii.shape[-1]
-    return first.radii.shape[-1] + world.bodies[pair[1]].radii.shape[-1]
+    second = world.bodies[pair[1]]
+    return first.radii.shape[-1] + second.radii.shape[-1] + edge_slots(first, second)
+
+
+def edge_slots(a: Body, b: Body) -> int:
+    """Return the number of contacts that the edges of two bodies can have: two for each edge of the first."""
+    first, second = a.hull, b.hull
+    if first is None or second is None or len(first.ridges) * len(second.ridges) > MOST_PLANES:
+        return 0
+    return 2 * len(first.ridges) if first.planes_against(second) <= MOST_PLANES else 0
 
 
 def near_ground(world: World, placed: Placed, step_s: Tensor) -> Tensor:
@@ -170,7 +182,8 @@ def body_points(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | N
         step_s: Step [s], shape (n,).
         sharpness_per_m: beta [1/m] of the published log-sum-exp distance; None for the simplex smooth minimum.
     """
-    flat_a, flat_b = _flat_faces(a, b)
+    parting = _parted(a, b)
+    flat_a, flat_b = parting.flat if parting is not None else (None, None)
     on_a = _against_union(a, b, step_s, sharpness_per_m, flat_a)
     on_b = _against_union(b, a, step_s, sharpness_per_m, flat_b)
     count = b.body.radii.shape[-1]
@@ -179,34 +192,91 @@ def body_points(a: Placed, b: Placed, step_s: Tensor, sharpness_per_m: float | N
         parts.append(replace(on_a, normal=-on_a.normal))
     if on_b is not None:
         parts.append(replace(on_b, slot=on_b.slot + count))
+    if parting is not None and sharpness_per_m is None:
+        reached = plain(step_s) * _speed_bound(a, b)
+        kept = _lowest(parting.gap - reached[:, None], ROUNDING_M + PAIR_SMOOTHING_M)
+        if kept is not None:
+            parts.append(_points_of_edges(a, b, parting, kept, reached))
     return _joined(parts) if parts else None
 
 
 def all_body_points(a: Placed, b: Placed) -> Points:
     """Return the points of all spheres of two bodies against the other body, touching or not, in slot order."""
-    flat_a, flat_b = _flat_faces(a, b)
+    parting = _parted(a, b)
+    flat_a, flat_b = parting.flat if parting is not None else (None, None)
     on_a, on_b = _all_against_union(a, b, flat_a), _all_against_union(b, a, flat_b)
-    return _joined([replace(on_a, normal=-on_a.normal), replace(on_b, slot=on_b.slot + b.body.radii.shape[-1])])
+    parts = [replace(on_a, normal=-on_a.normal), replace(on_b, slot=on_b.slot + b.body.radii.shape[-1])]
+    if parting is not None and parting.gap.shape[1]:
+        every = torch.arange(parting.gap.shape[1], device=parting.gap.device).expand_as(parting.other)
+        parts.append(_points_of_edges(a, b, parting, every, None))
+    return _joined(parts)
 
 
 def _joined(parts: Sequence[Points]) -> Points:
     return Points(*(torch.cat([getattr(part, name) for part in parts], 1) for name in Points.__dataclass_fields__))
 
 
-@torch.no_grad()
-def _flat_faces(a: Placed, b: Placed) -> tuple[Tensor | None, Tensor | None]:
-    """Return the faces (n,) of two hulls that lie flat on each other, -1 for none; None where a body has no hull.
+@dataclass(frozen=True)
+class _Parting:
+    """How two hulls part best, without derivatives."""
 
-    They are those parallel to the plane of one hull that parts it best from the other one.
+    flat: tuple[Tensor, Tensor]
+    """Faces (n,) of both hulls that lie flat on each other, -1 for none: those parallel to the plane of a face that
+    parts them best.
     """
+    other: Tensor
+    """Edge of the second hull in the slots of edges, shape (n, S)."""
+    gap: Tensor
+    """Gap there [m], infinite where no edges cross, shape (n, S)."""
+
+
+@torch.no_grad()
+def _parted(a: Placed, b: Placed) -> _Parting | None:
+    """Return how two hulls part best; None where a body has no hull, or one too curved to be compared."""
     first, second = a.body.hull, b.body.hull
     if first is None or second is None or first.planes_against(second) > MOST_PLANES:
-        return None, None
+        return None
     a, b = a.plain(), b.plain()
     height_a, out_of_a = _parting(a, first, b, second)
     height_b, out_of_b = _parting(b, second, a, first)
-    axis = torch.where((height_b > height_a)[:, None], -out_of_b, out_of_a)[:, None]
-    return parallel_face(first, (axis @ a.rotation)[:, 0]), parallel_face(second, (-axis @ b.rotation)[:, 0])
+    axis = torch.where((height_b > height_a)[:, None], -out_of_b, out_of_a)
+    along_a, along_b = ((sign * axis[:, None] @ x.rotation)[:, 0] for sign, x in ((1.0, a), (-1.0, b)))
+    flat = (parallel_face(first, along_a), parallel_face(second, along_b))
+    if not edge_slots(a.body, b.body):
+        none = torch.zeros((len(axis), 0), dtype=torch.int64, device=axis.device)
+        return _Parting(flat, none, axis.new_zeros(none.shape))
+    found = Crossings.of(_edges_of(a).across(2), _edges_of(b).across(1))
+    _, best = best_normal(found, torch.maximum(height_a, height_b), axis)
+    return _Parting(flat, *slots_of(found, best))
+
+
+def _edges_of(body: Placed) -> Edges:
+    if body.body.hull is None:
+        raise ValueError(f"body '{body.body.name}' has no hull")
+    return Edges.of(body.body.hull, body.centers(), body.radii(), body.rotation)
+
+
+def _points_of_edges(a: Placed, b: Placed, parting: _Parting, slot: Tensor, reached: Tensor | None) -> Points:
+    """Return the points of the slots (n, K) of edges; `reached` (n,) is how far points move within the step."""
+    first, second = _edges_of(a).chosen(slot // 2), _edges_of(b).chosen(parting.other.gather(1, slot))
+    found = Crossings.of(first, second)
+    gap = parting.gap.gather(1, slot)
+    near = gap - (0.0 if reached is None else reached[:, None]) < ROUNDING_M + PAIR_SMOOTHING_M
+    middle = first.radius + found.place * first.widening + 0.5 * found.gap
+    position = first.start + found.place[..., None] * first.along + middle[..., None] * found.normal
+    count = a.body.radii.shape[-1] + b.body.radii.shape[-1]
+    points = Points(slot=slot + count, near=near, gap=found.gap, normal=-found.normal, position=position)
+    return emptied(points, torch.isfinite(gap))
+
+
+def emptied(points: Points, there: Tensor) -> Points:
+    """Return points with those slots far away that have no contact."""
+    up = torch.zeros_like(points.normal)
+    up[..., 2] = 1.0
+    gap = torch.where(there, points.gap, torch.full_like(points.gap, FAR_M))
+    normal = torch.where(there[..., None], points.normal, up)
+    position = torch.where(there[..., None], points.position, torch.zeros_like(up))
+    return replace(points, gap=gap, normal=normal, position=position)
 
 
 def _parting(near: Placed, hull: Hull, far: Placed, other: Hull) -> tuple[Tensor, Tensor]:

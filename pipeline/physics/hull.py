@@ -33,10 +33,12 @@ OVERHANG_M = 1e-3
 """How far beyond the border of a flat face, which another body's face lies on, a sphere still touches its plane [m].
 Spheres at the rim of two equal faces would else be pushed off the rounded edges of the other body.
 """
+LEAST_SHARP = 0.996
+"""Largest cosine between the normals of two faces with an edge between them: 5 degrees."""
 PARALLEL = 0.98
 """Least cosine between the normals of faces that lie on each other."""
 MOST_PLANES = 4096
-"""Most products of faces and supports of two hulls for which flat contact is looked for; curved bodies have more."""
+"""Most products of faces and supports, or of edges, of two hulls that are compared; curved bodies have more."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,10 @@ class Hull:
     """Indices of the two spheres of each edge, shape (E, 2)."""
     supports: Tensor
     """Indices of the spheres that support the hull, shape (K,)."""
+    ridges: Tensor
+    """Indices of the two spheres of each edge between faces in different planes, shape (R, 2)."""
+    inward: Tensor
+    """Unit vectors in both faces of each such edge, orthogonal to it and away from it, shape (R, 2, 3)."""
 
     def planes_against(self, other: Hull) -> int:
         """Return how many planes and spheres of two hulls are compared where one lies on the other."""
@@ -73,7 +79,14 @@ class Hull:
         triangles, planes = found
         edges = _edges(c, triangles)
         faces = np.concatenate([planes, _feet(c, triangles, planes)], 1)
-        return Hull(torch.as_tensor(faces).to(centers), chosen[torch.as_tensor(edges).to(chosen)], chosen)
+        ridges, inward = _ridges_between(c, r, triangles, planes)
+        return Hull(
+            faces=torch.as_tensor(faces).to(centers),
+            edges=chosen[torch.as_tensor(edges).to(chosen)],
+            supports=chosen,
+            ridges=chosen[torch.as_tensor(ridges).to(chosen)],
+            inward=torch.as_tensor(inward).to(centers),
+        )
 
 
 def hull_distance(
@@ -210,6 +223,31 @@ def _edges(centers: Array, triangles: Corners) -> Corners:
     apart = np.linalg.norm(centers[bare, None] - centers, axis=2)
     apart[np.arange(len(bare)), bare] = np.inf
     return np.unique(np.concatenate([edges, np.sort(np.stack([bare, apart.argmin(1)], 1), axis=1)]), axis=0)
+
+
+def _ridges_between(centers: Array, radii: Array, triangles: Corners, planes: Array) -> tuple[Corners, Array]:
+    """Return the edges (R, 2) between two faces in different planes, and the vectors (R, 2, 3) away from them."""
+    sides: dict[tuple[int, int], list[int]] = {}
+    for face, corners in enumerate(triangles):
+        for pair in combinations(sorted(int(corner) for corner in corners), 2):
+            sides.setdefault(pair, []).append(face)
+    kept = [
+        (pair, faces)
+        for pair, faces in sides.items()
+        if len(faces) == 2 and planes[faces[0], :3] @ planes[faces[1], :3] < LEAST_SHARP
+    ]
+    found = np.array([pair for pair, _ in kept], dtype=np.int64).reshape(-1, 2)
+    inward = np.array([[_away(centers, radii, pair, triangles[f], planes[f]) for f in faces] for pair, faces in kept])
+    return found, inward.reshape(-1, 2, 3)
+
+
+def _away(centers: Array, radii: Array, pair: tuple[int, int], corners: Corners, plane: Array) -> Array:
+    """Return the unit vector in a face that is orthogonal to one of its edges and leads away from it."""
+    third = next(int(corner) for corner in corners if corner not in pair)
+    start, end, other = (centers[k] + radii[k] * plane[:3] for k in (*pair, third))
+    edge, away = end - start, other - start
+    away = away - edge * (away @ edge) / (edge @ edge)
+    return away / np.linalg.norm(away)
 
 
 def _thickness(centers: Array) -> float:

@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .contact_detection import Placed, Points, plain
+from .contact_detection import Placed, Points, emptied, plain
 from .fixed_surface import HALF_SPACE, FixedSurface
-
-FAR_M = 1e3
-"""Gap of a slot of a mesh in which a sphere has no contact [m]; its normal is z, its position the origin."""
 
 
 @dataclass(frozen=True)
@@ -82,17 +79,7 @@ def surface_points(
     points = replace(points, slot=slot, near=near)
     if feature is None:
         return points
-    return _emptied(points, torch.isfinite(nearby.depth.gather(1, slot)))
-
-
-def _emptied(points: Points, there: Tensor) -> Points:
-    """Return points with those slots far away that have no contact."""
-    up = torch.zeros_like(points.normal)
-    up[..., 2] = 1.0
-    gap = torch.where(there, points.gap, torch.full_like(points.gap, FAR_M))
-    normal = torch.where(there[..., None], points.normal, up)
-    position = torch.where(there[..., None], points.position, torch.zeros_like(up))
-    return replace(points, gap=gap, normal=normal, position=position)
+    return emptied(points, torch.isfinite(nearby.depth.gather(1, slot)))
 
 
 @torch.no_grad()

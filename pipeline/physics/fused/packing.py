@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...geometry.rotation import quat_multiply, quat_normalize, quat_rotate
-from ..contact_detection import GROUND, pairs_of, slot_count
+from ..contact_detection import GROUND, edge_slots, pairs_of, slot_count
 from ..contact_law import ContactLaw, coefficients
 from ..fixed_surface import HALF_SPACE, FixedSurface
 from ..joint_command import JointCommand
@@ -43,7 +43,8 @@ class Packed:
     """
     geometry: Tensor
     """Centres in the body frame and radii of the spheres [m]; then of each hull three rows a face, as `Hull.faces`,
-    one row an edge and one a support: the indices of their spheres within the body; shape (1 or B, rows, 4).
+    one row an edge and one a support: the indices of their spheres within the body; of each edge between different
+    planes the indices and two vectors, as `Hull.inward`; shape (1 or B, rows, 4).
     """
     surfaces: Tensor
     """Positions [m], orientations and sizes [m] of the fixed surfaces, shape (1 or B, surfaces, 10)."""
@@ -204,16 +205,22 @@ def _law_numbers(world: World) -> tuple[int, ...]:
     return numbers if any(numbers) else ()
 
 
-def _hulls(world: World) -> tuple[tuple[int, int, int, int], ...]:
-    """Return by body the first row of its hull in the geometry and the numbers of faces, edges and supports."""
+def _hulls(world: World) -> tuple[tuple[int, int, int, int, int], ...]:
+    """Return by body the first row of its hull in the geometry and the numbers of faces, edges, supports and ridges."""
     row, found = sum(body.radii.shape[-1] for body in world.bodies), []
     for body in world.bodies:
-        counts = (0, 0, 0)
+        counts = (0, 0, 0, 0)
         if body.hull is not None:
-            counts = (len(body.hull.faces), len(body.hull.edges), len(body.hull.supports))
+            hull = body.hull
+            counts = (len(hull.faces), len(hull.edges), len(hull.supports), len(hull.ridges))
         found.append((row, *counts))
-        row += 3 * counts[0] + counts[1] + counts[2]
+        row += _hull_size(*counts)
     return tuple(found)
+
+
+def _hull_size(faces: int, edges: int, supports: int, ridges: int) -> int:
+    """Return the number of rows of a hull in the geometry, as in `_hull_rows`."""
+    return 3 * faces + edges + supports + 3 * ridges
 
 
 def _steps(laws: Sequence[ContactLaw], times: Tensor, substeps: Tensor) -> Tensor:
@@ -286,12 +293,17 @@ def _surface(surface: FixedSurface, turn: Tensor | None) -> Tensor:
 
 
 def _hull_rows(body: Body) -> list[Tensor]:
-    """Return the rows of faces, edges and supports of a body's hull (1, rows, 4); none without a hull."""
-    if body.hull is None:
+    """Return the rows of faces, edges, supports and ridges of a body's hull (1, rows, 4); none without a hull."""
+    hull = body.hull
+    if hull is None:
         return []
-    edges, supports = body.hull.edges, body.hull.supports[:, None]
-    indices = [torch.nn.functional.pad(x, (0, 4 - x.shape[1])).to(body.hull.faces)[None] for x in (edges, supports)]
-    return [body.hull.faces.reshape(1, -1, 4), *indices]
+
+    def rows(x: Tensor) -> Tensor:
+        return torch.nn.functional.pad(x, (0, 4 - x.shape[-1])).to(hull.faces)
+
+    ridges = torch.cat((rows(hull.ridges)[:, None], rows(hull.inward)), 1)
+    parts = (hull.faces, rows(hull.edges), rows(hull.supports[:, None]), ridges)
+    return [part.reshape(1, -1, 4) for part in parts]
 
 
 def _patch_rows(world: World) -> list[Tensor]:
@@ -311,7 +323,7 @@ def _patch_rows(world: World) -> list[Tensor]:
 def _patch_starts(world: World) -> list[tuple[int, int]]:
     """Return by body the rows of the geometry in which the points of its patches and their areas begin."""
     row, found = sum(body.radii.shape[-1] for body in world.bodies), []
-    row += sum(3 * faces + edges + supports for _, faces, edges, supports in _hulls(world))
+    row += sum(_hull_size(*counts) for _, *counts in _hulls(world))
     for body in world.bodies:
         points = 0 if body.patch is None else len(body.patch.areas)
         areas = body.plane_areas
@@ -349,6 +361,8 @@ def _contact_spheres(world: World, starts: list[int]) -> Tensor:
         for index in (a,) if b < 0 else (b, a):
             rows = _rows(world.bodies[index], world.bodies[a].on_plane if plane else None, starts[index])
             parts.append(rows if surface is None else rows.repeat_interleave(surface.contacts_per_sphere))
+        if b >= 0:  # contacts of edges have no sphere
+            parts.append(torch.zeros_like(parts[-1][:1]).repeat(edge_slots(world.bodies[a], world.bodies[b])))
     return torch.cat(parts).to(torch.int32)
 
 

@@ -6,13 +6,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ...runtime import kernel_build
-from ..contact_detection import PAIR_SMOOTHING_M
+from ..contact_detection import FAR_M, PAIR_SMOOTHING_M
+from ..edge_contact import LEAST_CROSSING, OUT_OF_FACE
 from ..fixed_surface import BOX, HALF_SPACE, MESH
 from ..friction_ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
 from ..hull import MOST_PLANES, OVERHANG_M, PARALLEL, SAME_NORMAL, SAME_PLANE_M
 from ..impulse_solver import CONTACT_ONSET_M, LEAST_MOBILITY
 from ..joint_rows import LIMIT_TIME_S
-from ..surface_detection import FAR_M
 from ..surface_mesh import FLAT, MESH_CONTACTS, ORDER
 from .tree import Tree
 
@@ -35,7 +35,7 @@ _FILES = (
     "arithmetic",  # dual numbers, vectors and rotations, and sums over the threads of an environment
     "surface",  # effects of the contact between one body and the ground: formulas of physics/effects
     "chain",  # links of chains and their joints, as read from the table
-    "contacts",  # contacts with ground and unions of spheres: contact_detection, impulse_solver, smooth_distance
+    "contacts",  # contacts with ground, spheres and hulls: contact_detection, edge_contact, hull, impulse_solver
     "environment",  # what the kernel is given, and the state of an environment read from it
     "fixed_surface",  # distances of spheres to fixed surfaces: physics/fixed_surface and physics/surface_mesh
     "chain_motion",  # kinematics, equations of motion and joints of chains: formulas of chain_dynamics and joint_rows
@@ -75,8 +75,9 @@ class Structure:
     """Pairs of bodies that may touch, -1 for the ground, each with its number of contacts."""
     laws: tuple[int, ...] = ()
     """Number of the contact law of each pair; empty where all have the same one."""
-    hulls: tuple[tuple[int, int, int, int], ...] = ()
-    """First row in the geometry, faces, edges and supports of each body's hull; none where its spheres are touched."""
+    hulls: tuple[tuple[int, int, int, int, int], ...] = ()
+    """First row in the geometry of each body's hull, and its numbers of faces, edges, supports and edges between
+    different planes; none where the body's spheres are touched."""
     areas: tuple[int, ...] = ()
     """First row in the geometry of the areas of each pair's contacts, -1 where all count alike; empty for no areas."""
     lowest: tuple[tuple[int, int], ...] = ()
@@ -154,7 +155,7 @@ class Structure:
             "HALF_SPACE_KIND": HALF_SPACE, "BOX_KIND": BOX, "MESH_KIND": MESH,
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
             "LISTED": paired or alone, "CULLED": alone, "LAWS": self.law_count, "STEP_WIDTH": 2 + 2 * self.law_count,
-            "HULLS": paired and any(faces for _, faces, _, _ in self.hulls),
+            "HULLS": paired and any(faces for _, faces, *_ in self.hulls),
             "PATCHES": bool(self.areas),
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
             "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
@@ -164,6 +165,7 @@ class Structure:
         lines = [f"#define {name} {int(value)}" for name, value in constants.items()]
         lines += [f"#define SMOOTHING_M {PAIR_SMOOTHING_M!r}", f"#define SAME_PLANE_M {SAME_PLANE_M!r}"]
         lines += [f"#define SAME_NORMAL {SAME_NORMAL!r}", f"#define OVERHANG_M {OVERHANG_M!r}"]
+        lines += [f"#define LEAST_CROSSING {LEAST_CROSSING!r}", f"#define OUT_OF_FACE {OUT_OF_FACE!r}"]
         lines += [f"#define PARALLEL {PARALLEL!r}", f"#define MOST_PLANES {MOST_PLANES}"]
         lines += [f"#define ONSET_M {CONTACT_ONSET_M!r}", f"#define LEAST_MOBILITY {LEAST_MOBILITY!r}"]
         lines += [f"#define NEWTON_STEPS {NEWTON_STEPS}", f"#define FLATTEST {FLATTEST!r}"]
@@ -183,7 +185,7 @@ class Structure:
             "group_of": tree.groups(self.free),
             "body_link": [tree.bodies.index(b) if b in tree.bodies else -1 for b in range(len(self.free))],
         }  # fmt: skip
-        for index, name in enumerate(("hull_start", "face_count", "edge_count", "support_count")):
+        for index, name in enumerate(("hull_start", "face_count", "edge_count", "support_count", "ridge_count")):
             lists[name] = [hull[index] for hull in self.hulls]
         functions = [_function(name, values) for name, values in lists.items()] + tree.lists()
         return "\n".join((*lines, kernel_file("language"), *functions, *map(kernel_file, _FILES)))

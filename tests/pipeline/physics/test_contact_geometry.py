@@ -6,9 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 from cgwm.pipeline.geometry.directions import fibonacci_directions
+from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import simulate
 from cgwm.pipeline.physics.checks import overlaps
 from cgwm.pipeline.physics.contact_detection import Placed, all_body_points
+from cgwm.pipeline.physics.edge_contact import Crossings, Edges, best_normal
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.hull import Hull, hull_distance
 from cgwm.pipeline.physics.impulse_solver import tangent_axes
@@ -17,7 +19,7 @@ from cgwm.pipeline.physics.rollout_cost import rollout_seconds
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.physics.world import Body
 from cgwm.schemas import NotConvergedError
-from helpers.worlds import F64, ball_body, batch, law, state_of, times, world_of
+from helpers.worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 
 UP = (1.0, 0.0, 0.0, 0.0)
 
@@ -105,6 +107,34 @@ def test_the_distance_to_a_hull_is_that_to_its_support_function() -> None:
     torch.testing.assert_close(over(normal[0]), distance[0], atol=1e-12, rtol=0)
     for direction in torch.as_tensor(fibonacci_directions(300)):
         assert bool((over(direction.expand(500, 3)) <= distance[0] + 1e-12).all())
+
+
+def test_two_boxes_part_best_along_the_normal_of_a_face_or_of_two_edges() -> None:
+    """Where they overlap, no direction parts them better; the gap along it is that of their support functions."""
+    generator = torch.Generator().manual_seed(0)
+    box = box_body((0.05, 0.03, 0.02), radius=0.002)
+    centers, radii = box.centers[0], box.radii[0]
+    hull = Hull.of(centers, radii, plane_contacts(centers, radii))
+    assert hull is not None and len(hull.ridges) == 12
+    turn = quat_to_matrix(torch.nn.functional.normalize(torch.randn(60, 4, generator=generator, dtype=F64), dim=-1))
+    place = 0.05 * torch.randn(60, 1, 3, generator=generator, dtype=F64)
+    other = centers @ turn.transpose(1, 2) + place
+
+    def gap(n: torch.Tensor) -> torch.Tensor:
+        return (other @ n[..., None]).squeeze(-1).amin(-1) - (n @ centers.T).amax(-1) - 2 * 0.002
+
+    here = Edges.of(hull, centers.expand(60, -1, -1), radii[None], torch.eye(3, dtype=F64).expand(60, 3, 3))
+    there = Edges.of(hull, other, radii[None], turn)
+    found = Crossings.of(here.across(2), there.across(1))
+    faces = torch.cat((hull.faces[:, :3].expand(60, -1, -1), -hull.faces[:, :3] @ turn.transpose(1, 2)), 1)
+    heights = torch.stack([gap(faces[:, k]) for k in range(faces.shape[1])], 1)
+    height, face = heights.max(1)
+    most, normal = best_normal(found, height, faces[torch.arange(60), face])
+    torch.testing.assert_close(gap(normal), most, rtol=0, atol=1e-12)
+    deep = most < 0
+    assert 5 < int((deep & (most > height)).sum()) < int(deep.sum())
+    for direction in torch.as_tensor(fibonacci_directions(2000)):
+        assert bool((gap(direction.expand(60, 3)) <= most + 1e-12)[deep].all())
 
 
 def test_spheres_in_one_plane_have_no_hull() -> None:

@@ -148,11 +148,13 @@ struct Facing {
     Number sharp_gap;  // to the nearest sphere, without smoothing
 };
 
-#if HULLS
+#if !HULLS
+struct Parting {};
+#else
 INLINE Hull hull_of(const Problem& problem, const Environment& env, int b) {
     Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(b), sphere_count(b)};
     Hull hull = {spheres,       env.geometry + 4LL * hull_start(b), face_count(b), edge_count(b),
-                 support_count(b)};
+                 support_count(b), ridge_count(b)};
     return hull;
 }
 
@@ -199,24 +201,96 @@ INLINE int flat_face(const Problem& problem, const Environment& env, int b, cons
     return face;
 }
 
-// Finds the faces of two bodies that lie flat on each other: those parallel to the plane that parts their hulls best.
-INLINE void find_flat(const Problem& problem, const Environment& env, int a, int b, const Mat* rotations, int& on_a,
-                      int& on_b) {
-    on_a = on_b = -1;
-    if (face_count(a) == 0 || face_count(b) == 0) return;
-    if (face_count(a) * support_count(b) + face_count(b) * support_count(a) > MOST_PLANES) return;
-    Number most = Number(-1e30), axis[3] = {Number(0), Number(0), Number(1)};
-    part_by(problem, env, a, b, rotations, Number(1), most, axis);
-    part_by(problem, env, b, a, rotations, Number(-1), most, axis);
-    on_a = flat_face(problem, env, a, rotations[a], Number(1), axis);
-    on_b = flat_face(problem, env, b, rotations[b], Number(-1), axis);
+struct Parting {  // how two hulls part best
+    int on_a, on_b;  // faces that lie flat on each other, -1 for none: parallel to the face that parts them best
+    Number gap, axis[3];  // largest gap along a normal of a face or of two edges, and that normal, out of a
+};
+
+// The edge of body b in the frame of body a.
+INLINE Edge edge_in(const Problem& problem, const Environment& env, int a, int b, const Mat* rotations, int i) {
+    Edge edge = placed_edge(edge_of(hull_of(problem, env, b), i), rotations[b],
+                            env.bodies[b].position - rotations[b] * env.constants[b].com - env.bodies[a].position);
+    Edge turned = {transposed(rotations[a], edge.start) + env.constants[a].com, transposed(rotations[a], edge.along),
+                   transposed(rotations[a], edge.inward), transposed(rotations[a], edge.other_inward), edge.radius,
+                   edge.widening};
+    return turned;
+}
+
+// Finds how the hulls of two bodies part best; false where they are not compared.
+__device__ bool part(const Problem& problem, const Environment& env, int p, const Mat* rotations, Parting& found) {
+    int a = pair_a(p), b = pair_b(p);
+    found.on_a = found.on_b = -1;
+    if (face_count(a) == 0 || face_count(b) == 0) return false;
+    if (face_count(a) * support_count(b) + face_count(b) * support_count(a) > MOST_PLANES) return false;
+    found.gap = Number(-1e30);
+    found.axis[0] = found.axis[1] = Number(0);
+    found.axis[2] = Number(1);
+    part_by(problem, env, a, b, rotations, Number(1), found.gap, found.axis);
+    part_by(problem, env, b, a, rotations, Number(-1), found.gap, found.axis);
+    found.on_a = flat_face(problem, env, a, rotations[a], Number(1), found.axis);
+    found.on_b = flat_face(problem, env, b, rotations[b], Number(-1), found.axis);
+    if (contact_count(p) == sphere_count(a) + sphere_count(b)) return true;
+    Hull hull = hull_of(problem, env, a);
+    for (int j = 0; j < ridge_count(b); j++) {
+        Edge second = edge_in(problem, env, a, b, rotations, j);
+        for (int i = 0; i < hull.ridges; i++) {
+            Crossing crossing;
+            if (!cross_edges(edge_of(hull, i), second, crossing)) continue;
+            if (crossing.lean > Number(0) || !(plain(crossing.gap) > found.gap)) continue;
+            found.gap = plain(crossing.gap);
+            Vec normal = rotations[a] * crossing.normal;
+            found.axis[0] = plain(normal.x);
+            found.axis[1] = plain(normal.y);
+            found.axis[2] = plain(normal.z);
+        }
+    }
+    return true;
+}
+
+// Finds the contact of one slot of edges: where an edge of a comes over b, or where it leaves it.
+__device__ bool face_edges(const Problem& problem, const Environment& env, int p, int slot, const Mat* rotations,
+                           Number limit, const Parting& parting, Facing& facing) {
+    int a = pair_a(p), b = pair_b(p);
+    Edge first = edge_of(hull_of(problem, env, a), slot / 2);
+    Vec axis = vec(Real(parting.axis[0]), Real(parting.axis[1]), Real(parting.axis[2]));
+    axis = transposed(rotations[a], axis);
+    // its normals are orthogonal to it
+    Number along = plain(dot(axis, first.along)), length2 = plain(dot(first.along, first.along));
+    if (along * along > Number(1 - PARALLEL * PARALLEL) * length2) return false;
+    Number least = limit;
+    int other = -1;
+    for (int j = 0; j < ridge_count(b); j++) {
+        Crossing crossing;
+        if (!cross_edges(first, edge_in(problem, env, a, b, rotations, j), crossing)) continue;
+        if (!crossing.within || crossing.leaves != (slot % 2 == 1)) continue;
+        if (crossing.lean > Number(OUT_OF_FACE) || !(plain(dot(crossing.normal, axis)) > Number(PARALLEL))) continue;
+        if (!(plain(crossing.gap) < least)) continue;
+        least = plain(crossing.gap);
+        other = j;
+    }
+    if (other < 0) return false;
+    Crossing crossing;
+    cross_edges(first, edge_in(problem, env, a, b, rotations, other), crossing);
+    Vec point = first.start + crossing.place * first.along +
+                (first.radius + crossing.place * first.widening + Number(0.5) * crossing.gap) * crossing.normal;
+    facing.gap = crossing.gap;
+    facing.sharp_gap = plain(crossing.gap);
+    facing.normal = -(rotations[a] * crossing.normal);
+    facing.point = env.bodies[a].position + rotations[a] * (point - env.constants[a].com);
+    return true;
 }
 #endif
 
 // Finds gap, normal and point of one slot of a pair of bodies: first come the spheres of b against the union of a, then
-// those of a against the union of b. Returns false if the gap exceeds `limit`. The faces are those of `find_flat`.
+// those of a against the union of b, then edges. Returns false if the gap exceeds `limit`.
 __device__ bool face(const Problem& problem, const Environment& env, int p, int k, const Mat* rotations, Number limit,
-                     int flat_a, int flat_b, Facing& facing) {
+                     const Parting& parting, Facing& facing) {
+#if HULLS
+    int spheres_in_all = sphere_count(pair_a(p)) + sphere_count(pair_b(p));
+    if (k >= spheres_in_all) {
+        return face_edges(problem, env, p, k - spheres_in_all, rotations, limit, parting, facing);
+    }
+#endif
     bool second = k >= sphere_count(pair_b(p));
     int mine = second ? pair_a(p) : pair_b(p), other = second ? pair_b(p) : pair_a(p);
     Vec position = env.bodies[other].position;
@@ -237,7 +311,7 @@ __device__ bool face(const Problem& problem, const Environment& env, int p, int 
 #if HULLS
     if (face_count(other) > 0) {
         Hull hull = hull_of(problem, env, other);
-        if (!distance_to_hull(hull, local, second ? flat_b : flat_a, reached, distance, nearest, outward)) return false;
+        if (!distance_to_hull(hull, local, second ? parting.on_b : parting.on_a, reached, distance, nearest, outward)) return false;
     } else
 #endif
     {
@@ -269,18 +343,20 @@ __device__ int touch_pair(const Problem& problem, Environment& env, int p, const
     Number left = Number(1) - Number(0.5) * h * spins;
     Number limit = left > Number(0.01) ? h * V / left + Number(1e-6) : Number(1e30);
     if (size(com_a - com_b) - ca.reach - cb.reach - Number(SMOOTHING_M) < limit) {
-        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES, on_a = -1, on_b = -1;
+        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES, end = contact_count(p);
+        Parting parting;
 #if LINKS
         reveal(env, motions, a);
         reveal(env, motions, b);
 #endif
 #if HULLS
-        find_flat(problem, env, a, b, rotations, on_a, on_b);
+        // nothing of one hull is nearer to the other one than the gap along the normal that parts them best
+        if (part(problem, env, p, rotations, parting) && parting.gap > limit) end = 0;
 #endif
-        for (int k = behind; k < contact_count(p); k += LANES) {
+        for (int k = behind; k < end; k += LANES) {
             Facing facing;
             Real weight;
-            if (!face(problem, env, p, k, rotations, limit, on_a, on_b, facing)) continue;
+            if (!face(problem, env, p, k, rotations, limit, parting, facing)) continue;
             Contact& c = list[count];
             c.normal = facing.normal;
             c.arm = facing.point - com_a;

@@ -326,7 +326,7 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
 struct Hull {  // of a body's spheres, in its frame: see physics/hull.py
     Union spheres;
     long long row;  // of the first face
-    int faces, edges, supports;
+    int faces, edges, supports, ridges;
     // value of affine function `k` of face `i`: height over the plane (0), barycentric coordinates of the foot (1, 2)
     INLINE Number affine(int i, int k, const Number* p) const {
         const Number* f = spheres.geometry.value + row + 4LL * (3 * i + k);
@@ -361,7 +361,60 @@ struct Hull {  // of a body's spheres, in its frame: see physics/hull.py
     INLINE int sphere(int edge, int end) const {
         return (int)spheres.geometry.value[row + 4LL * (3 * faces + edge) + end];
     }
+    // First row of an edge between faces in different planes: its spheres, then vectors away from it in both faces.
+    INLINE long long ridge(int i) const { return row + 4LL * (3 * faces + edges + supports + 3 * i); }
 };
+
+struct Edge {  // between two faces of a hull, in any frame: see physics/edge_contact.py
+    Vec start, along, inward, other_inward;
+    Real radius, widening;
+};
+
+INLINE Edge edge_of(const Hull& hull, int i) {
+    const Input& geometry = hull.spheres.geometry;
+    long long row = hull.ridge(i);
+    int first = (int)geometry.value[row], second = (int)geometry.value[row + 1];
+    Vec start = hull.spheres.center(first);
+    Real radius = hull.spheres.radius(first);
+    Edge edge = {start, hull.spheres.center(second) - start, geometry.vector(row + 4), geometry.vector(row + 8),
+                 radius, hull.spheres.radius(second) - radius};
+    return edge;
+}
+
+INLINE Edge placed_edge(const Edge& edge, const Mat& rotation, Vec origin) {
+    Edge placed = {origin + rotation * edge.start, rotation * edge.along, rotation * edge.inward,
+                   rotation * edge.other_inward, edge.radius, edge.widening};
+    return placed;
+}
+
+struct Crossing {  // the common normal of two edges, out of the first body
+    Vec normal;
+    Real gap, place;
+    Number lean;  // by how much the normal leans towards a face of either edge
+    bool within;  // whether its feet lie within the edges
+    bool leaves;  // whether the first edge, from its first to its second end, leaves the other body
+};
+
+// Returns false for edges that are nearly parallel.
+INLINE bool cross_edges(const Edge& first, const Edge& second, Crossing& found) {
+    Vec over = cross(first.along, second.along), apart = second.start - first.start;
+    Real size2 = dot(over, over);
+    Number lengths = plain(dot(first.along, first.along)) * plain(dot(second.along, second.along));
+    if (plain(size2) <= Number(LEAST_CROSSING) * lengths) return false;
+    Real each = inverse_root(size2), less = each * each;
+    if (plain(dot(first.inward + first.other_inward, over)) > Number(0)) each = -each;
+    found.normal = each * over;
+    found.place = less * dot(cross(apart, second.along), over);
+    Real other = less * dot(cross(apart, first.along), over);
+    found.gap = dot(found.normal, apart) - first.radius - found.place * first.widening - second.radius -
+                other * second.widening;
+    found.lean = greater(greater(plain(dot(found.normal, first.inward)), plain(dot(found.normal, first.other_inward))),
+                         -lesser(plain(dot(found.normal, second.inward)), plain(dot(found.normal, second.other_inward))));
+    found.leaves = plain(dot(second.inward + second.other_inward, first.along)) < Number(0);
+    found.within = plain(found.place) >= Number(0) && plain(found.place) <= Number(1) && plain(other) >= Number(0) &&
+                   plain(other) <= Number(1);
+    return true;
+}
 
 // Returns the distance of a point from the hull of two spheres, and the outward normal.
 INLINE Real edge_distance(const Hull& hull, int edge, Vec at, Vec& outward) {

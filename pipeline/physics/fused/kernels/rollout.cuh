@@ -112,9 +112,9 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
         searched.sphere = -1;
 #endif
 #if PAIRED
-        int on_a = -1, on_b = -1;
+        Parting parting;
 #if HULLS
-        if (pair_b(p) >= 0) find_flat(problem, env, a, pair_b(p), rotations, on_a, on_b);
+        if (pair_b(p) >= 0) part(problem, env, p, rotations, parting);
 #endif
 #endif
         EACH_SLOT
@@ -126,10 +126,17 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
 #if PAIRED
             if (pair_b(p) >= 0) {
                 Facing facing;
-                face(problem, env, p, k, rotations, Number(1e30), on_a, on_b, facing);
-                gap = facing.gap;
-                normal = facing.normal;
-                point = facing.point;
+                if (face(problem, env, p, k, rotations, Number(1e30), parting, facing)) {
+                    gap = facing.gap;
+                    normal = facing.normal;
+                    point = facing.point;
+                } else {
+                    gap = Real(Number(FAR_M));
+                    point = none();
+#if TURNED
+                    normal = env.turn * normal;
+#endif
+                }
             } else
 #endif
 #if FIXED

@@ -168,6 +168,37 @@ def test_cubes_that_lie_flat_on_each_other(fused: Fused) -> None:
     agree(expected, fused(world, state, times(0.06), None, True, lanes=None), 1e-7)
 
 
+def planks() -> tuple[World, State]:
+    """Return a plank that falls across another one and is tilted, so that edges meet: no corner touches a face."""
+    low = box_body((0.1, 0.02, 0.02), radius=5e-4)
+    low, top = (replace(low, name=name, hull=hull_of(low)) for name in ("low", "top"))
+    still, falling = ((0, 0, 0.0199), UPRIGHT, (0, 0, 0), (0, 0, 0)), ((0.2, 0, -0.5), (0, 1, 0))
+    return world_of(low, top), state_of(still, ((0.01, 0, 0.0675), (0.7, 0.15, 0, 0.7), *falling), count=2)
+
+
+def test_edges_that_cross(fused: Fused) -> None:
+    world, state = planks()
+    expected = simulate(world, state, times(0.06), None, True)
+    assert expected.contacts is not None
+    impulse, touches = expected.contacts.impulse_n_s.norm(dim=-1).amax((0, 1)), expected.contacts.body_b == 1
+    assert float(impulse[touches][:16].max()) == 0 < float(impulse[touches][16:].max())
+    agree(expected, fused(world, state, times(0.06), None, True, lanes=None), 1e-7)
+
+
+def test_a_plank_that_lies_across_another_one_rests_on_the_four_points_where_their_edges_cross(fused: Fused) -> None:
+    world, _ = planks()
+    low, top = (((0, 0, z), (1, 0, 0, turn), (0, 0, 0), (0, 0, 0)) for z, turn in ((0.01995, 0), (0.0599, 1)))
+    found = fused(world, state_of(low, top, count=2), times(0.3), None, True, lanes=None)
+    contacts = found.contacts
+    assert contacts is not None
+    carried = contacts.impulse_n_s[0, -1][contacts.body_b == 1]
+    acts = carried[:, 2].abs() > 1e-6
+    torch.testing.assert_close(carried[acts, 2], torch.full((4,), -0.4 * 9.81 * 0.01 / 4, dtype=F64), rtol=1e-3, atol=0)
+    places = contacts.position_m[0, -1][contacts.body_b == 1][acts, :2]
+    torch.testing.assert_close(places.abs(), torch.full((4, 2), 0.0195, dtype=F64), rtol=0, atol=1e-4)
+    assert float(found.velocity_m_s[0, -1].abs().max()) < 1e-5
+
+
 @pytest.mark.parametrize("lanes", [1, pytest.param(8, marks=pytest.mark.evidence)])
 def test_a_box_whose_faces_are_plates(fused: Fused, lanes: int) -> None:
     """Alone, it tumbles; then it lies, under a ball, and slides."""
@@ -440,6 +471,20 @@ def test_derivatives_of_cubes_that_lie_on_each_other(fused: Fused) -> None:
     world, _, driven = crowd()
     low, top, *others = world.bodies
     world = replace(world, bodies=(replace(flat_cube(2), name=low.name), replace(top, hull=hull_of(top)), *others))
+    first = [0, 0, 0.053, 0.01, 0.02, 0.01, 0.05, 0.02, -0.1, 0.3, 0.5, -0.2]
+    agree_with_derivatives(fused, world, first, times(0.03), driven, 0.0)
+
+
+@pytest.mark.evidence
+def test_derivatives_of_edges_that_cross(fused: Fused) -> None:
+    """A plank falls askew on an edge of the cube, beyond which its corners are."""
+    world, state, driven = crowd()
+    low, top, *others = world.bodies
+    plank = replace(box_body((0.07, 0.012, 0.012), 0.15), name=top.name)
+    world = replace(world, bodies=(replace(flat_cube(2), name=low.name), replace(plank, hull=hull_of(plank)), *others))
+    contacts = simulate(world, state, times(0.03), driven, True).contacts
+    assert contacts is not None
+    assert contacts.impulse_n_s[0][:, (contacts.body_a == 0) & (contacts.body_b == 1)][:, 16:].abs().max() > 0
     first = [0, 0, 0.053, 0.01, 0.02, 0.01, 0.05, 0.02, -0.1, 0.3, 0.5, -0.2]
     agree_with_derivatives(fused, world, first, times(0.03), driven, 0.0)
 
