@@ -1,11 +1,14 @@
-"""The benchmark: Fall and Push. One motion of 15 frames to learn from, longer ones to predict open loop.
+"""The benchmark: Fall, Push and Tip. One motion of 15 frames to learn from, longer ones to predict open loop.
 
 python benchmarks/fall_push.py --folder /tmp/tabletop --device cpu --workers 2 [--objects box --rows "cgwm; frozen"]
+python benchmarks/fall_push.py --folder /tmp/tabletop --engines mujoco,drake,dart,rapier --rows "cgwm; frozen; floor"
 python benchmarks/fall_push.py --table
+python benchmarks/fall_push.py --table --by-engine
 
-Every (task, object, material, row) is a stored result, taken up again, so that the table can be finished in several
-runs, on several machines: join the stores' lines. What is there of captures and models in the folder is used; the
-model of an object is fitted once a task, to the photos of the first material's capture.
+The truth is MuJoCo, or what --engines names (`tabletop/engines`); captures of another seed are other motions.
+Every (engine, task, object, material, row) is a stored result, taken up again, so that the table can be finished in
+several runs, on several machines: join the stores' lines. What is there of captures and models in the folder is used;
+the model of an object is fitted once a task, to the photos of the first material's capture.
 """
 
 from __future__ import annotations
@@ -17,20 +20,25 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from cgwm.pipeline.fit import fit
 from cgwm.schemas import CgwmError, SplatConfig
 from contenders.base import Cell
 from contenders.rows import REFERENCE, ROWS
+from fall_push_engines import engine_table
 from fall_push_table import table
 from scoring import Judge
 from store import Store, timed
+from tabletop.capture import TASKS, Task
+from tabletop.engines import ENGINES, refusal
+from tabletop.objects import load_item
 
-TASKS = ("fall", "push")
 TESTS = 10
+ENGINE = "mujoco"
+"""The engine of the older results."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +50,13 @@ class Job:
     material: str
     row: str
     cell: Cell
+    engine: str = ENGINE
 
     @property
     def key(self) -> str:
         """The result's key in the store."""
-        return "/".join((self.task, self.object, self.material, self.row, f"seed {self.cell.seed}", self.cell.device))
+        names = (self.task, self.object, self.material, self.row, f"seed {self.cell.seed}", self.cell.device)
+        return "/".join(names if self.engine == ENGINE else (*names, self.engine))
 
 
 @dataclass(frozen=True)
@@ -57,37 +67,38 @@ class Work:
     seed: int
     device: str
 
-    def capture(self, task: str, obj: str, material: str) -> Path:
+    def capture(self, task: str, obj: str, material: str, engine: str = ENGINE) -> Path:
         """Return the directory of a capture."""
-        return self.folder / f"{obj}_{material}_{task}"
+        return self.folder / ("" if engine == ENGINE else engine) / f"{obj}_{material}_{task}"
 
     def splats(self, task: str, obj: str) -> Path:
         """Return the directory of a model without physics."""
         return self.folder / "models" / f"{obj}_{task}"
 
-    def cell(self, task: str, obj: str, material: str) -> Cell:
-        """Return what contenders are given."""
-        return Cell(self.capture(task, obj, material), self.splats(task, obj), self.device, self.seed)
+    def cell(self, task: str, obj: str, material: str, engine: str = ENGINE) -> Cell:
+        """Return what contenders are given; photos, and so splats, are the same whatever the engine."""
+        return Cell(self.capture(task, obj, material, engine), self.splats(task, obj), self.device, self.seed)
 
-    def make_capture(self, task: str, obj: str, material: str) -> None:
+    def make_capture(self, task: str, obj: str, material: str, engine: str = ENGINE) -> None:
         """Make a capture where there is none; its cameras are the true ones."""
-        path = self.capture(task, obj, material)
+        path = self.capture(task, obj, material, engine)
         if not path.exists():
             from tabletop import make_capture
 
-            make_capture(path, obj, material, task, self.seed, TESTS)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            make_capture(path, obj, material, cast(Task, task), self.seed, TESTS, engine=engine)
 
-    def make_splats(self, task: str, obj: str, material: str) -> None:
+    def make_splats(self, task: str, obj: str, material: str, engine: str = ENGINE) -> None:
         """Fit the spheres of an object to the photos of one of its captures."""
         out = self.splats(task, obj)
         if not out.exists():
             config = SplatConfig(seed=self.seed, device=self.device)  # pyright: ignore[reportArgumentType]
-            fit(self.capture(task, obj, material), out, stage="sg-gs", splat_config=config)
+            fit(self.capture(task, obj, material, engine), out, stage="sg-gs", splat_config=config)
 
 
 def measure(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, Any]:
     """Fit and judge one row in one cell. A fit that fails is a result, too: `failed` says why."""
-    figures: dict[str, Any] = {key: getattr(job, key) for key in ("task", "object", "material", "row")}
+    figures: dict[str, Any] = {key: getattr(job, key) for key in ("task", "object", "material", "row", "engine")}
     figures |= {"seed": job.cell.seed, "device": job.cell.device, "budget_s": budget_s, "psnr_every": psnr_every}
     return figures | timed(lambda: _measured(job, budget_s, psnr_every))
 
@@ -101,6 +112,8 @@ def _measured(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, An
         return {"failed": reason, "fit": {"seconds": round(time.perf_counter() - started, 2)}}
     judge, record = Judge.of(job.cell, psnr_every), fitted.record
     errors = judge.parameter_errors(record.get("parameters", {}))
+    if job.engine != ENGINE:  # nobody else has the numbers of MuJoCo's contacts
+        errors = {name: value for name, value in errors.items() if name == "friction"}
     return {"fit": record, "parameter_errors": errors, "episodes": judge.episode_errors(fitted)}
 
 
@@ -110,16 +123,26 @@ def run(work: Work, store: Store, names: dict[str, Sequence[str]], pool: Executo
     Args:
         work: Where things lie.
         store: Takes the results, as they come.
-        names: Which tasks, objects, materials and rows are wanted.
+        names: Which tasks, objects, materials, engines and rows are wanted; what an engine cannot simulate is left out.
         pool: Who works.
         psnr_every: Compare every so manyth frame of the test videos; 0: none.
     """
     pairs = [(task, obj) for task in names["tasks"] for obj in names["objects"]]
-    cells = [(task, obj, material) for task, obj in pairs for material in names["materials"]]
-    jobs = [Job(*cell, row, work.cell(*cell)) for cell in cells for row in names["rows"]]
+    cells = [
+        (task, obj, material, engine)
+        for task, obj in pairs
+        for material in names["materials"]
+        for engine in names["engines"]
+        if refusal(engine, load_item(obj).solid) is None
+    ]
+    jobs = [
+        Job(task, obj, material, row, work.cell(task, obj, material, engine), engine)
+        for task, obj, material, engine in cells
+        for row in names["rows"]
+    ]
     jobs = [job for job in jobs if store.known(job.key) is None]
-    wanted = sorted({(job.task, job.object, job.material) for job in jobs})
-    photographed = sorted({(task, obj, names["materials"][0]) for task, obj, _ in wanted})
+    wanted = sorted({(job.task, job.object, job.material, job.engine) for job in jobs})
+    photographed = sorted({cell[:2]: cell for cell in reversed(wanted)}.values())
 
     def each(function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> None:
         for done in as_completed([pool.submit(function, *one) for one in arguments]):
@@ -141,7 +164,7 @@ def _budget(store: Store, job: Job) -> float | None:
     factor = ROWS[job.row].budget
     if factor is None:
         return None
-    reference = store.known(Job(**(vars(job) | {"row": REFERENCE})).key)
+    reference = store.known(replace(job, row=REFERENCE).key)
     if reference is None:
         raise SystemExit(f"{job.key}: its budget is the time of the row '{REFERENCE}', which is to be in --rows first.")
     return factor * reference["fit"]["seconds"]
@@ -152,7 +175,8 @@ def main() -> int:
     from tabletop import MATERIALS, OBJECTS
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", default=",".join(TASKS))
+    parser.add_argument("--tasks", default="fall,push")
+    parser.add_argument("--engines", default=ENGINE, help="whose motions are the truth: " + ", ".join(ENGINES))
     parser.add_argument("--objects", default=",".join(OBJECTS))
     parser.add_argument("--materials", default=",".join(MATERIALS))
     parser.add_argument("--rows", default="; ".join(ROWS), help="names of rows, separated by semicolons")
@@ -163,13 +187,21 @@ def main() -> int:
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
     parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
     parser.add_argument("--psnr-every", type=int, default=1, help="compare every so manyth frame; 0: none")
+    parser.add_argument("--by-engine", action="store_true", help="with --table: rows against each engine")
     parser.add_argument("--table", action="store_true", help="print the table of what is stored, and measure nothing")
     given = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
     store = Store("fall_push", given.store, given.any_commit)
-    names = {key: [one.strip() for one in getattr(given, key).split(",")] for key in ("tasks", "objects", "materials")}
+    kinds = ("tasks", "objects", "materials", "engines")
+    names: dict[str, Sequence[str]] = {key: [one.strip() for one in getattr(given, key).split(",")] for key in kinds}
     names["rows"] = [one.strip() for one in given.rows.split(";")]
-    for key, legal in (("tasks", TASKS), ("objects", OBJECTS), ("materials", MATERIALS), ("rows", ROWS)):
+    for key, legal in (
+        ("tasks", TASKS),
+        ("objects", OBJECTS),
+        ("materials", MATERIALS),
+        ("engines", ENGINES),
+        ("rows", ROWS),
+    ):
         unknown = [one for one in names[key] if one not in legal]
         if unknown:
             parser.error(f"--{key}: {unknown[0]!r} is none of {', '.join(legal)}")
@@ -177,7 +209,7 @@ def main() -> int:
         work = Work(given.folder.resolve(), given.seed, given.device)
         with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
             run(work, store, names, pool, given.psnr_every)
-    print(table(store.results(), names, given.seed))
+    print(engine_table(store.results(), names) if given.by_engine else table(store.results(), names, given.seed))
     return 0
 
 

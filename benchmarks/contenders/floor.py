@@ -1,7 +1,9 @@
 """The floor: our engine with the true numbers, the true shape and mass: what the contact model itself cannot express.
 
 It alone reads the truth. MuJoCo's natural time and damping ratio of a contact are the contact time and damping ratio of
-ours; friction is that with the ground, for our law has one friction for all.
+ours; friction belongs to the pair: that with the ground, and that with the fingertip. Shape is the true mesh, filled
+with spheres, whose faces are flat where it fills its hull. Engines other than MuJoCo state the numbers that their
+contacts were made from; `engine_floor.py` finds those that predict them best.
 """
 
 from __future__ import annotations
@@ -15,17 +17,22 @@ import numpy as np
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
+from cgwm.datasets.shapes.meshes import mass_properties, read_mesh
 from cgwm.datasets.synthetic import read_truth
+from cgwm.datasets.synthetic.dynamics import FINGERTIP
 from cgwm.pipeline.demo.truth_tables import OBJECT
 from cgwm.pipeline.physics.contact_law import ContactLaw
+from cgwm.pipeline.physics.hull import Hull
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.physics.world import State, World, symmetric
-from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
+from cgwm.pipeline.sg_gs.collision_spheres import fills_hull, shape_to_spheres
 from cgwm.schemas import ContactParameters, FileShape, Shape
+from cgwm.schemas.materials import pair_of
 
 from .base import Array, Cell, Prediction
 from .training import rolled_out
 
+_GROUND = "ground"
 SPHERES = 200
 """Most collision spheres, as in `cgwm fit`."""
 
@@ -51,6 +58,10 @@ class Floor:
 
         index = world.body_names.index(OBJECT)
         centers, radii = tensor(spheres.means), tensor(factor * spheres.scales)
+        on_plane = plane_contacts(centers[0], radii[0])
+        volume = mass_properties(read_mesh(cell.capture / truth.object.mesh)).volume_m3
+        convex = fills_hull(np.asarray(spheres.means, float), factor * np.asarray(spheres.scales, float), volume)
+        hull = Hull.of(centers[0], radii[0], on_plane) if convex else None
         body = replace(
             world.bodies[index],
             mass=tensor(truth.object.mass_kg),
@@ -58,7 +69,9 @@ class Floor:
             com=tensor(truth.object.com_m),
             centers=centers,
             radii=radii,
-            on_plane=plane_contacts(centers[0], radii[0]),
+            on_plane=on_plane,
+            hull=hull,
+            patch=None,
         )
         bodies = (*world.bodies[:index], body, *world.bodies[index + 1 :])
         contact = truth.contact
@@ -67,7 +80,11 @@ class Floor:
             "contact_time_s": contact.natural_time_s,
             "damping_ratio": contact.damping_ratio,
         }
-        law = ContactLaw(**{name: tensor(value) for name, value in numbers.items()})
+        laws = {
+            name: ContactLaw(**{key: tensor(value) for key, value in (numbers | {"friction": friction}).items()})
+            for name, friction in ((_GROUND, contact.friction), (FINGERTIP, contact.friction_fingertip))
+            if friction is not None
+        }
         record = {
             "seconds": round(time.perf_counter() - started, 2),
             "evaluations": 0,
@@ -75,7 +92,10 @@ class Floor:
             "spheres": len(spheres.means),
             "surface_distance_m": distance,
         }
-        return FittedFloor(replace(world, bodies=bodies, contact=law), record)
+        pairs = {pair_of(OBJECT, FINGERTIP): laws[FINGERTIP]} if FINGERTIP in laws else {}
+        bodies = tuple(replace(one, material=one.name) for one in bodies)
+        world = replace(world, bodies=bodies, contact=laws[_GROUND], pair_laws=pairs, ground_material=_GROUND)
+        return FittedFloor(world, record)
 
 
 @dataclass(frozen=True, eq=False)

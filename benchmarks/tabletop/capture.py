@@ -41,6 +41,7 @@ def make_capture(
     photo_size: tuple[int, int] = (640, 480),
     photos: int = 48,
     overwrite: bool = False,
+    engine: str = "mujoco",
 ) -> Path:
     """Make a capture; the same arguments give the same bytes.
 
@@ -58,6 +59,8 @@ def make_capture(
         photo_size: Width and height of the photos [px].
         photos: Number of photos.
         overwrite: Replace what is at `folder`.
+        engine: Whose motions are the truth, one of `ENGINES`. Natural time and damping ratio of truth.json are those
+            that its contacts were made from; only MuJoCo has them as such.
 
     Returns:
         `folder` as a path.
@@ -67,12 +70,13 @@ def make_capture(
         InputDataError: If a scanned object is not in the cache and cannot be made.
         NotConvergedError: If no motion could be drawn that serves.
     """
-    for kind, value, allowed in (("object", obj, OBJECTS), ("material", material, MATERIALS), ("task", task, TASKS)):
+    names = (("object", obj, OBJECTS), ("material", material, MATERIALS), ("task", task, TASKS))
+    for kind, value, allowed in (*names, ("engine", engine, ENGINES)):
         if value not in allowed:
             raise UsageError(f"unknown {kind} '{value}'.", ", ".join(allowed) + "." + did_you_mean(value, allowed))
     item = load_item(obj)
-    plan, rejected = plan_capture(item, obj, material, task, seed, tests)
-    print(f"{obj} {material} {task}: draws left out: {rejected or 'none'}", flush=True)
+    plan, rejected = plan_capture(item, obj, material, task, seed, tests, engine)
+    print(f"{obj} {material} {task} {engine}: draws left out: {rejected or 'none'}", flush=True)
     with new_directory(Path(folder), "capture", overwrite) as directory:
         stage = build_set(plan, photo_size, video_size, photos, item.paint, item.scan, _SAMPLES, _STILL)
         record(stage, directory)

@@ -24,12 +24,12 @@ from helpers.worlds import ball_body, box_body, state_of, world_of
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 TESTS = ("001", "002")
-NAMES = {"tasks": ("fall",), "objects": ("box",), "materials": ("wood",)}
+NAMES = {"tasks": ("fall",), "objects": ("box",), "materials": ("wood",), "engines": ("mujoco",)}
 pytestmark = pytest.mark.evidence
 FEW = {"generations": 3, "population": 16, "iterations": 2}
 
 
-MODULES = ("fall_push", "fall_push_table", "scoring", "store")
+MODULES = ("fall_push", "fall_push_engines", "fall_push_table", "scoring", "store")
 CONTENDERS = ("cem_mujoco", "cgwm_default", "floor", "mujoco_world", "paper", "pinwm", "rows", "training", "zeros")
 
 
@@ -201,3 +201,23 @@ def test_in_mujoco_a_driven_body_follows_its_command_and_pushes(bench):
     assert np.abs(tip_x - (begin + 0.2 * times)).max() < 1e-9
     assert abs(box[-1, 0] - (tip_x[-1] + reach)) < 3e-3
     assert abs(box[-1, 2] - half[2]) < 2e-3
+
+
+def test_the_table_by_engine_pairs_captures_and_leaves_mujoco_out_of_the_pool(bench) -> None:
+    def row(engine: str, name: str, shift: float) -> dict:
+        return {
+            "engine": engine, "task": "fall", "object": "box", "material": "wood", "seed": 0, "row": name,
+            "fit": {"parameters": {"friction": 0.4}, "intervals_95": {"friction": [0.3, 0.38]}, "seconds": 1.0},
+            "parameter_errors": {"friction": 0.1},
+            "episodes": [{"episode": "001", "translation_mm": 10.0 + shift, "rotation_deg": 5.0}],
+        }  # fmt: skip
+
+    rows = [row("drake", "cgwm", 0), row("drake", "frozen", 5), row("dart", "cgwm", 2), row("dart", "frozen", 7)]
+    rows += [row("mujoco", "cgwm", 90), row("mujoco", "frozen", 95)]
+    names = {**NAMES, "rows": ("cgwm", "frozen"), "engines": ("mujoco", "drake", "dart")}
+    found = bench.fall_push_engines.engine_table(rows, names)
+    pooled = found.split("**fall, all engines but MuJoCo**")[1].split("**fall, mujoco**")[0]
+    assert "| cgwm | 2 | 11.0 (11.0) |" in pooled
+    assert "| frozen | 2 | 16.0 (16.0) |" in pooled and "+5.0 (+5.0 to +5.0)" in pooled
+    assert "2 of 2" in pooled  # 0.4 / 1.1 lies in the interval
+    assert "100.0 (100.0)" in found.split("**fall, mujoco**")[1]
