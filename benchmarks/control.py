@@ -33,7 +33,7 @@ import torch
 from cgwm.datasets.models.model import Model, read_model
 from cgwm.datasets.shapes.meshes import Mesh, joined_properties, read_mesh
 from cgwm.datasets.shapes.ply import Splats
-from cgwm.datasets.synthetic.objects import FAMILIES, make_object, resting_down
+from cgwm.datasets.synthetic.objects import FAMILIES, hull_of, make_object, resting_down
 from cgwm.pipeline.control.controller import Controller, ControlPlan, ControlState
 from cgwm.pipeline.control.horizon import Targets
 from cgwm.pipeline.control.loop import run
@@ -56,7 +56,6 @@ from cgwm.schemas import (
     Pose,
     Provenance,
 )
-from scipy.spatial import ConvexHull
 from store import Store, shared_data
 
 OBJECTS = ("t_block", "box", "l_block", "mug")
@@ -155,14 +154,7 @@ def _mug(folder: Path) -> tuple[list[Path], float, np.ndarray]:
 
 
 def _hull(points: np.ndarray) -> Mesh:
-    """Return the convex hull of points, its triangles facing outwards."""
-    hull = ConvexHull(points)
-    used = np.unique(hull.simplices)
-    vertices, faces = points[used], np.searchsorted(used, hull.simplices).astype(np.int64)
-    normals = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
-    inward = (normals * (vertices[faces].mean(1) - vertices.mean(0))).sum(1) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return Mesh(vertices, faces)
+    return Mesh(*hull_of(points))
 
 
 def _grey(count: int) -> np.ndarray:

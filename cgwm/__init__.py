@@ -52,6 +52,7 @@ _PUBLIC = {
     "merge": ".pipeline.synthesize",
     "open_view": ".pipeline.view",
     "read_model": ".datasets.models",
+    "run_control_demo": ".pipeline.demo",
     "run_demo": ".pipeline.demo",
     "run_mystery": ".pipeline.demo",
     "run_world": ".pipeline.demo",
@@ -80,6 +81,7 @@ if TYPE_CHECKING:
     from .pipeline.compare import compare
     from .pipeline.control import ClosedLoop, Controller, ControlPlan, ControlState, Reach, Targets, Velocity, control
     from .pipeline.demo import (
+        run_control_demo,
         run_demo,
         run_mystery,
         run_world,
@@ -158,6 +160,7 @@ __all__ = [
     "merge",
     "open_view",
     "read_model",
+    "run_control_demo",
     "run_demo",
     "run_mystery",
     "run_world",

@@ -12,7 +12,15 @@ from .options import AnyDevice, Overwrite
 from .verb import verb
 
 if TYPE_CHECKING:
-    from ..schemas import ComparedParameter, DemoResult, DemoTarget, ImagesOnlyFit, MysteryResult, WorldDemoResult
+    from ..schemas import (
+        ComparedParameter,
+        ControlDemoResult,
+        DemoResult,
+        DemoTarget,
+        ImagesOnlyFit,
+        MysteryResult,
+        WorldDemoResult,
+    )
 
 
 @verb
@@ -20,10 +28,11 @@ def demo(
     emit: Emit,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The directory to write.", show_default=False)],
     scene: Annotated[
-        Literal["fall", "push", "bin", "ramp", "mystery"],
+        Literal["fall", "push", "control", "bin", "ramp", "mystery"],
         typer.Option(
             "--scene",
-            help="fall: an object falls and bounces; push: a fingertip pushes an object; bin: five objects are dropped "
+            help="fall: an object falls and bounces; push: a fingertip pushes an object; "
+            "control: a fitted model plans the pushes that bring its object to a pose; bin: five objects are dropped "
             "into a tray; ramp: a block slides and a ball rolls down onto a floor of another material; mystery: fit, "
             "compare and diagnose search for an effect that is hidden in the physics or the measurement.",
         ),
@@ -41,6 +50,12 @@ def demo(
             from ..pipeline.demo import run_mystery
 
         emit(run_mystery(out, seed, device, overwrite), lambda result: _story(result, out))
+        return
+    if scene == "control":
+        with loading():
+            from ..pipeline.demo import run_control_demo
+
+        emit(run_control_demo(out, seed, device, overwrite), lambda result: _control(result, out))
         return
     if scene in ("bin", "ramp"):
         with loading():
@@ -76,6 +91,20 @@ def _story(result: MysteryResult, out: Path) -> str:
     lines.append(f"hidden    {result.sentence}" + "".join(f" True: {words}." for words in truth))
     lines += [*warnings(result.warnings), f"{sum(result.seconds.values()):.0f} s."]
     return "\n".join([*lines, f"Report: {out / result.paths['report']}"])
+
+
+def _control(result: ControlDemoResult, out: Path) -> str:
+    from .output import table, warnings
+
+    rows = [_row(p) for p in result.parameters if p.parameter.state == "fitted"]
+    lines = [
+        result.verdict,
+        table(rows, ["parameter", "estimate", "95 % interval", "truth", "unit"]),
+        f"{sum(result.seconds.values()):.0f} s.",
+        *warnings(result.warnings),
+        f"Report: {out / result.paths['report']}",
+    ]
+    return "\n".join(lines)
 
 
 def _world(result: WorldDemoResult, out: Path) -> str:

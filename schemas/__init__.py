@@ -50,6 +50,7 @@ from .control import (
     read_task,
     task_toml,
 )
+from .control_demo import ControlDemoResult
 from .dataset import (
     DATASET_FORMAT,
     ROLLOUTS_FORMAT,
@@ -99,6 +100,7 @@ from .errors import (
     NotEnoughMemoryError,
     NotEnoughSpaceError,
     OutputExistsError,
+    SlowPlansError,
     UsageError,
     did_you_mean,
 )
@@ -176,6 +178,7 @@ __all__ = [
     "ComparedParameter",
     "ContactLimit",
     "ContactParameters",
+    "ControlDemoResult",
     "ControlResult",
     "ControlRun",
     "ControlTask",
@@ -275,6 +278,7 @@ __all__ = [
     "ShardEntry",
     "ShardsSummary",
     "ShortDifference",
+    "SlowPlansError",
     "Solver",
     "SolverName",
     "SphereShape",

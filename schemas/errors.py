@@ -61,6 +61,10 @@ class InputDataError(CgwmError):
     exit_code = 2
 
 
+class SlowPlansError(InputDataError):
+    """Plans take longer here than a task of control allows (exit code 2)."""
+
+
 class NotConvergedError(CgwmError):
     """A fit, a calibration or a simulation failed to reach a usable result (exit code 1)."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,6 +42,7 @@ def make_scene(
     photo_size: tuple[int, int] = (640, 480),
     video_size: tuple[int, int] = (480, 360),
     photos: int = 48,
+    splits: tuple[str, ...] = ("train", "test"),
 ) -> Path:
     """Write the capture of a synthetic scene; the same arguments give the same bytes.
 
@@ -55,6 +57,7 @@ def make_scene(
         photo_size: Width and height of the photos [px].
         video_size: Width and height of the video frames [px].
         photos: Number of photos.
+        splits: Splits whose episodes are filmed.
 
     Returns:
         `out` as a path.
@@ -74,7 +77,9 @@ def make_scene(
             "at least 3 photos, and sides of at least 16 px.",
         )
     with new_directory(Path(out), "capture", overwrite) as directory:
-        record(build_set(plan_scene(name, seed), photo_size, video_size, photos), directory)
+        plan = plan_scene(name, seed)
+        plan = replace(plan, episodes=tuple(one for one in plan.episodes if one.split in splits))
+        record(build_set(plan, photo_size, video_size, photos), directory)
     return Path(out)
 
 

@@ -221,6 +221,31 @@ def _stands(base: Array, normal: Array, com: Array) -> bool:
 
 def write_obj(path: Path, solid: SolidObject) -> None:
     """Write the surface as Wavefront OBJ, body frame, metres."""
-    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in solid.vertices]
-    lines += ["f {} {} {}".format(*(face + 1)) for face in solid.faces]
+    _write_surface(path, solid.vertices, solid.faces)
+
+
+def write_parts(folder: Path, solid: SolidObject) -> tuple[str, ...]:
+    """Write the convex parts as `part0.obj`, `part1.obj`, ..., body frame, metres, and return these names."""
+    names = tuple(f"part{number}.obj" for number in range(len(solid.parts)))
+    for name, corners in zip(names, solid.parts, strict=True):
+        _write_surface(folder / name, *hull_of(corners))
+    return names
+
+
+def hull_of(points: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Return corners (vertex, 3) and triangles (face, 3) of the convex hull of points, its faces outwards."""
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points)
+    used = np.unique(hull.simplices)
+    vertices, faces = points[used], np.searchsorted(used, hull.simplices).astype(np.int64)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * (a - vertices.mean(0))).sum(1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return vertices, faces
+
+
+def _write_surface(path: Path, vertices: Array, faces: NDArray[np.int64]) -> None:
+    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices]
+    lines += ["f {} {} {}".format(*(face + 1)) for face in faces]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -10,11 +10,11 @@ import numpy as np
 
 from ...datasets.rollouts.control_file import RunTables
 from ...schemas import ControlResult, ControlRun, ControlTask
-from ..report.page import cautions, facts, fixed, folded, number, page, paragraph, section, table, text, way_link
+from ..report.page import cautions, facts, film, fixed, folded, number, page, paragraph, section, table, text, way_link
 from ..report.plots import Plot, Series, legend, plot_svg
 from .film import AHEAD_S
 
-PAGE = "control.html"
+PAGE, FILM = "control.html", "run.webm"
 MOST_POINTS = 400
 """Largest number of points of a line."""
 MOST_LINES = 6
@@ -31,21 +31,24 @@ class PageRun:
     """Its arrays."""
 
 
-def control_html(result: ControlResult, task: ControlTask, runs: Sequence[PageRun], sheet: str) -> str:
+def control_html(
+    result: ControlResult, task: ControlTask, runs: Sequence[PageRun], webm: bytes | None, sheet: str
+) -> str:
     """Return the page of runs.
 
     Args:
         result: The result.
         task: The task.
         runs: The runs.
-        sheet: URI of some frames of the film; empty for none.
+        webm: The film; None for none.
+        sheet: URI of some of its frames; empty for none.
     """
     body = [
         f"<h1>cgwm control · {text(Path(result.task).name)} · {text(result.object)}</h1>",
         f'<p class="verdict">{text(result.sentence)}</p>',
         cautions([*result.warnings, *([result.advice] if result.advice else [])]),
         section("Runs", _table(result)),
-        _film(result, sheet),
+        _film(result, webm, sheet),
         section("Errors", *_errors(task, runs)),
         section("Way of object and finger", *_ways(task, runs)),
         _times(result, task, runs),
@@ -69,16 +72,17 @@ def _table(result: ControlResult) -> str:
     return table(header, rows, numeric=(0, *range(2, len(header))), sorts=True)
 
 
-def _film(result: ControlResult, sheet: str) -> str:
-    """Return the section with the film's frames."""
-    if result.video is None:
+def _film(result: ControlResult, webm: bytes | None, sheet: str) -> str:
+    """Return the section with the film and some of its frames."""
+    if result.video is None or webm is None:
         return ""
     told = (
-        f"Seed {result.runs[0].seed}: above the plant, below what a plan had predicted {AHEAD_S:g} s before. The cross "
-        "is the goal."
+        f"Seed {result.runs[0].seed}: left, and above, the plant; right, and below, what a plan had predicted "
+        f"{AHEAD_S:g} s before. The cross is the goal."
     )
     picture = f'<img src="{sheet}" alt="plant and prediction, six moments" style="max-width:100%">'
-    return section("Plant and prediction", paragraph(told), picture, f"<p>{way_link('The film', result.video)}</p>")
+    shown = film(webm, "plant beside prediction")
+    return section("Plant and prediction", paragraph(told), shown, picture, facts([("film", way_link(FILM, FILM))]))
 
 
 def _errors(task: ControlTask, runs: Sequence[PageRun]) -> list[str]:

@@ -23,8 +23,8 @@ from ...schemas import (
     ControlResult,
     ControlRun,
     ControlTask,
-    InputDataError,
     InterruptedWork,
+    SlowPlansError,
     SolverName,
     UsageError,
     read_json,
@@ -37,14 +37,14 @@ from .controller import Controller, ControlState
 from .film import film_of
 from .loop import run
 from .mujoco_plant import MujocoPlant
-from .page import PAGE, PageRun, control_html
+from .page import FILM, PAGE, PageRun, control_html
 from .plant import ModelPlant, Plant, start_of
 from .tables import figures_of, tables_of
 from .task_world import task_world
 from .wording import advice, sentence, wilson
 from .work import control_budget
 
-DOCUMENT, RECORDING, FILM = "control.json", "run.h5", "run.webm"
+DOCUMENT, RECORDING = "control.json", "run.h5"
 MOST_DRAWS = 1000
 """Largest number of draws: each is a world of its own."""
 TRIALS = 7
@@ -177,7 +177,7 @@ def _require_speed(controller: Controller, plant: Plant) -> None:
     """Check that a plan does not take much longer than a command.
 
     Raises:
-        InputDataError: If it does, with the rate that is reached.
+        SlowPlansError: If it does, with the rate that is reached.
     """
     truth = plant.reset(*start_of(controller.task_world, 0))
     durations = []
@@ -193,7 +193,7 @@ def _require_speed(controller: Controller, plant: Plant) -> None:
     taken, task = float(np.median(durations[TRIALS // 2 :])), controller.task
     if taken > SLOWEST * controller.interval_s:
         reason = f" Predictions run in the slow engine: {controller.slow}." if controller.slow else ""
-        raise InputDataError(
+        raise SlowPlansError(
             f"{task.source}: [planner] control_hz = {task.planner.control_hz:g}: a plan takes {1e3 * taken:.0f} ms "
             f"here, so {1 / taken:.3g} a second.{reason}",
             f"up to {SLOWEST / taken:.3g}, of which half is reached.",
@@ -241,7 +241,7 @@ def _write(
         if film is not None:
             (folder / FILM).write_bytes(film)
         result = _result(request, controller, runs, names, folder / RECORDING, None if film is None else FILM)
-        page = control_html(result, request.task, runs, sheet)
+        page = control_html(result, request.task, runs, film, sheet)
         (folder / PAGE).write_text(page, encoding="utf-8")
         (folder / DOCUMENT).write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
     return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import math
 import os
@@ -55,7 +56,7 @@ def page(title: str, body: Sequence[str], style: str = "", script: str = "", mad
         f"{mark}"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         # The page needs nothing from the network, so it may not ask for anything either.
-        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
+        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; media-src data:; '
         "style-src 'unsafe-inline'; script-src 'unsafe-inline'\">\n"
         f"<title>{text(title)}</title>\n<style>{STYLE}{style}</style>\n</head>\n<body>\n<main>\n"
         + "\n".join(_with_contents(body))
@@ -110,6 +111,15 @@ def listed(names: Sequence[str], last: str = "and") -> str:
 def command(words: str) -> str:
     """Return a command to type, as it would be typed."""
     return f"<pre><code>{text(words)}</code></pre>"
+
+
+def film(webm: bytes, words: str) -> str:
+    """Return a film (WebM) that the page itself holds, and which begins by itself, without sound, again and again."""
+    data = base64.b64encode(webm).decode("ascii")
+    return (
+        f'<video controls autoplay muted loop playsinline style="max-width:100%" aria-label="{text(words)}" '
+        f'src="data:video/webm;base64,{data}"></video>'
+    )
 
 
 def folded(summary: str, *pieces: str) -> str:
