@@ -117,7 +117,7 @@ def film(webm: bytes, words: str) -> str:
     """Return a film (WebM) that the page itself holds, and which begins by itself, without sound, again and again."""
     data = base64.b64encode(webm).decode("ascii")
     return (
-        f'<video controls autoplay muted loop playsinline style="max-width:100%" aria-label="{text(words)}" '
+        f'<video controls autoplay muted loop playsinline style="width:100%" aria-label="{text(words)}" '
         f'src="data:video/webm;base64,{data}"></video>'
     )
 
