@@ -7,19 +7,27 @@ from collections.abc import Sequence
 from ...schemas import Articulation, ArticulationModel, InputDataError
 
 TAKEN_BY = (
-    "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval', 'synthesize', 'view', 'export' and ClosedLoop take "
-    "jointed bodies"
+    "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval', 'compare', 'synthesize', 'view', 'export' and "
+    "ClosedLoop take jointed bodies"
 )
 """What does."""
+INSTEAD = (
+    "fit the numbers of the joints with 'cgwm fit'; 'cgwm compare {model} {capture}' shows in which phase of the "
+    "motion, and at which link, short predictions miss"
+)
+"""What to do where an effect cannot be named."""
 
 
-def refuse_joints(articulations: Sequence[Articulation | ArticulationModel], where: str, what: str) -> None:
+def refuse_joints(
+    articulations: Sequence[Articulation | ArticulationModel], where: str, what: str, instead: str = ""
+) -> None:
     """Refuse jointed bodies.
 
     Args:
         articulations: Those of the model or capture.
         where: The model or capture, for the message.
         what: What does not take them.
+        instead: What to do instead, as a sentence without a capital; nothing in particular by default.
 
     Raises:
         InputDataError: If there is one.
@@ -29,5 +37,5 @@ def refuse_joints(articulations: Sequence[Articulation | ArticulationModel], whe
         raise InputDataError(
             f"{where}: it has jointed bodies ({names}), which {what} does not take yet.",
             "models and captures without [[articulations]].",
-            f"{TAKEN_BY}; the Python API simulates them (docs/python-api.md).",
+            f"{instead or TAKEN_BY + '; the Python API simulates them (docs/python-api.md)'}.",
         )

@@ -60,14 +60,14 @@ def wrench_points(world: World, fit: ShortFit, prepared: Prepared) -> tuple[list
     """Return the segments of the motion as points, and the coordinates that explain the residual wrench in flight.
 
     Flight is divided into half-overlapping windows; in contact the fitted segments are used. Both lists are empty for
-    several free bodies.
+    several free bodies and for jointed ones.
 
     Args:
         world: The world of the model.
         fit: The short predictions of the model.
         prepared: The episodes, cut into segments.
     """
-    if len(world.free) != 1:
+    if len(world.free) != 1 or world.chains:
         return [], []
     points: list[WrenchPoint] = []
     episodes = prepared.names

@@ -12,7 +12,6 @@ from ...datasets.capture.tracks import Episode
 from ...datasets.io.atomic import new_file, sha256
 from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note, progress
-from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import Model, read_model
 from ...schemas import CompareResult, InputDataError, PairedDifference, UsageError
 from ...schemas.regular_files import real_path
@@ -85,8 +84,6 @@ def compare(
         refuse_output(out, "page", overwrite)
     _refuse_twice(models)
     loaded = [(str(path), read_model(path)) for path in models]
-    for name, model in loaded:
-        refuse_joints(model.file.articulations, name, "compare")
     accepted = accept_units or any(model.accepts_units for _, model in loaded)
     source = Capture.open(capture, splits=(split,), accept_units=accepted)
     with _checked_work(loaded, source, split):
@@ -128,7 +125,7 @@ def compare_models(
     episodes: list[Episode] = [Episode(name, capture.tracks(name)) for name in shared]
     first, given = World.from_model(models[0][1]), capture.manifest.measurement
     prepared = prepare(first, episodes, (given.position_std_m, given.rotation_std_rad))
-    bodies = [first.bodies[k].name for k in first.free]
+    bodies = [first.bodies[k].name for k in first.tracked]
     compared = _with_short_predictions(models, evaluations, capture, episodes, prepared, bodies)
     figures = tuple(one.figures() for one in compared)
     best = min(figures, key=lambda one: one.translation_error_m.median)

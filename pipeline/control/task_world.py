@@ -158,7 +158,8 @@ def task_world(model: Model, task: ControlTask) -> TaskWorld:
 
 
 def _require_model(model: Model) -> None:
-    refuse_joints(model.file.articulations, model.place, "control")
+    instead = "the finger pushes a rigid body; the Python API's ClosedLoop steps jointed ones (docs/python-api.md)"
+    refuse_joints(model.file.articulations, model.place, "control", instead)
     if model.cameras is not None and model.cameras.scale.kind == "unscaled":
         raise InputDataError(
             f"{model.place}: the model has no scale: its cameras are unscaled.",

@@ -15,7 +15,7 @@ from ...datasets.capture.capture import Capture
 from ...datasets.io.atomic import new_file
 from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note
-from ...datasets.models.joints import refuse_joints
+from ...datasets.models.joints import INSTEAD, refuse_joints
 from ...datasets.models.model import Model, read_model
 from ...schemas import (
     ContactLimit,
@@ -105,7 +105,7 @@ def diagnose(
     compared = experiments_of(DEFAULT) if throws is None else read_experiments(throws)
     library = library_of(candidates)
     loaded = read_model(model)
-    refuse_joints(loaded.file.articulations, str(model), "diagnose")
+    refuse_joints(loaded.file.articulations, str(model), "diagnose", INSTEAD.format(model=model, capture=capture))
     accepted = accept_units or loaded.accepts_units
     opened = Capture.open(capture, splits=(split,), accept_units=accepted)
     note(f"diagnose: flights, contacts and noise of {len(opened.episodes(split))} episodes")

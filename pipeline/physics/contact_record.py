@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .contact_detection import GROUND, Placed, Points, all_body_points, ground_points, pairs_of, slot_count
+from .contact_detection import FAR_M, GROUND, Placed, Points, all_body_points, ground_points, pairs_of, slot_count
 from .contact_solver import PairImpulses, put
 from .surface_detection import all_surface_points
 from .world import World
@@ -82,6 +82,7 @@ class Recorder:
                 points = _as_acted(points, acted, facing, depth / weight.clamp_min(1e-30))
             elif b != GROUND:
                 points = _turned(points, acted, facing, total)
+                points = _as_acted(points, acted & (points.gap >= FAR_M), facing, depth / weight.clamp_min(1e-30))
             place = torch.where(acted[..., None], weighted / weight.clamp_min(1e-30)[..., None], points.position)
             columns.append((total, place, points.normal, points.gap, (sliding > 0.5 * weight) & acted))
         self.steps = []
@@ -129,7 +130,7 @@ def _turned(points: Points, acted: Tensor, facing: Tensor, total: Tensor) -> Poi
 
 
 def _as_acted(points: Points, acted: Tensor, facing: Tensor, gap: Tensor) -> Points:
-    """Return contacts of a mesh with normal and gap of their impulses; slots may have others at the frame."""
+    """Return contacts with normal and gap of their impulses; slots of meshes and edges may have others at the frame."""
     size = facing.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-30)
     normal = torch.where(acted[..., None], facing / size, points.normal)
     return replace(points, normal=normal, gap=torch.where(acted, gap, points.gap))

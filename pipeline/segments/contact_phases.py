@@ -64,10 +64,10 @@ def contact_phases(contact: Segments) -> list[list[PhaseName]]:
     speeds = _surface_speeds(world, rollout.velocity_m_s, rollout.omega_body_rad_s)
     limit = LIMITS.rest_m_s + contact.noise.position_m / steps.median() * 0.5
     weight = world.gravity[0].norm() * torch.cat((steps[:, :1], steps), 1)
-    mass = min(float(world.bodies[k].mass[0]) for k in world.free)
+    mass = min(float(world.bodies[k].mass[0]) for k in world.tracked)
     total, slides = normal.sum(-1), (normal * record.sliding).sum(-1)
     round_share = _round_share(world, record.body_a, normal)
-    turning = torch.stack([rollout.omega_body_rad_s[:, :, k].norm(dim=-1) for k in world.free]).amax(0)
+    turning = torch.stack([rollout.omega_body_rad_s[:, :, k].norm(dim=-1) for k in world.tracked]).amax(0)
     found: list[list[PhaseName]] = []
     for item, count in enumerate(contact.lengths):
         names: list[PhaseName] = []
@@ -93,7 +93,7 @@ def contact_phases(contact: Segments) -> list[list[PhaseName]]:
 def _surface_speeds(world: World, velocity: Tensor, omega: Tensor) -> Tensor:
     """Return the largest speed (B, T) [m/s] of any free body's surface, to a factor of two."""
     parts = [
-        velocity[:, :, k].norm(dim=-1) + size_of(world.bodies[k]) * omega[:, :, k].norm(dim=-1) for k in world.free
+        velocity[:, :, k].norm(dim=-1) + size_of(world.bodies[k]) * omega[:, :, k].norm(dim=-1) for k in world.tracked
     ]
     return torch.stack(parts).amax(0)
 

@@ -134,14 +134,17 @@ def prepare(
     """
     state = _State.of(world, episodes, given)
     state.segment()
-    _mark_supported_frames(state)
-    _remove_outliers(state)
-    _remove_held_starts(state)
-    _model_correlated_noise(state)
+    if world.chains:
+        state.fit_flights()  # links do not fall as bodies do, by which the following steps judge
+    else:
+        _mark_supported_frames(state)
+        _remove_outliers(state)
+        _remove_held_starts(state)
+        _model_correlated_noise(state)
     turned = state.oriented
     if _touches_nothing(world):
         state.contact = []  # what does not fly is in a hand or was caught: it says nothing of a law of contact
-    elif not turned and not all(is_round(world.bodies[k]) for k in world.free):
+    elif not turned and not all(is_round(world.bodies[k]) for k in world.tracked):
         state.contact = []
         state.warnings.append("no orientation was measured and the body is not a ball: contacts cannot be examined.")
     released = {episodes[k][0]: float(state.observations.times_s[k, first]) for k, first in state.held.items()}
@@ -153,7 +156,7 @@ def prepare(
         airborne=state.airborne,
         supported=state.supported,
         noise=state.noise,
-        slow=1.0 if state.noise_model.position.share else slow_noise(state.observations, state.flight),
+        slow=1.0 if state.noise_model.position.share or world.chains else slow_noise(state.observations, state.flight),
         flight=state.fitted,
         contact_items=tuple(state.contact),
         outliers=state.outliers,
@@ -206,11 +209,11 @@ class _State:
         given: tuple[float | None, float | None],
     ) -> _State:
         """Return the episodes from their releases on with a rough estimate of their noise, not yet cut."""
-        free = [world.bodies[k].name for k in world.free]
+        free = [world.bodies[k].name for k in world.tracked]
         rough = estimate_noise([tracks[name] for _, tracks in episodes for name in free if name in tracks])
         noise = Noise(given[0] or rough[0], given[1] or rough[1])
         every = whole_episodes(world, episodes)
-        held = carried_starts(world, every, noise)
+        held = {} if world.chains else carried_starts(world, every, noise)
         whole = without_held(every, held)
         nothing = torch.zeros_like(whole.seen[..., 0], dtype=torch.bool)
         return _State(

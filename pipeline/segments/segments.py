@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.rotation import continuous_turns, quat_exp, quat_multiply
+from ..physics.chain_state import on_joints
 from ..physics.contact_law import ContactLaw
 from ..physics.engine import rollout as rolled_out
 from ..physics.engine import rollouts_at_once
@@ -99,8 +100,8 @@ class Segments:
         return replace(self, items=picked, observations=self.observations.select(items))
 
     def with_state(self, state: State) -> Segments:
-        """Return the segments with other states."""
-        return replace(self, observations=replace(self.observations, state=state))
+        """Return the segments with other states, in which links are on their joints."""
+        return replace(self, observations=replace(self.observations, state=on_joints(self.world, state)))
 
     def in_world(self, world: World) -> Segments:
         """Return the segments in another world, with the step that their kind needs."""

@@ -209,6 +209,8 @@ def clear_frames(world: World, observations: Observations, noise: Noise) -> Tens
         clear &= _apart(others[..., None], FLIGHT_MARGIN_M + LIMITS.height_sigmas * noise.position_m)
     for a in range(len(observations.free)):
         for b in range(a):
+            if world.chains and world.chain_of(observations.free[a]) == world.chain_of(observations.free[b]) >= 0:
+                continue  # links of one jointed body do not touch each other
             reach = size_of(world.bodies[observations.free[a]]) + size_of(world.bodies[observations.free[b]])
             gap = (observations.position_m[:, :, a] - observations.position_m[:, :, b]).norm(dim=-1) - reach
             clear &= _apart(gap[..., None], FLIGHT_MARGIN_M + LIMITS.height_sigmas * noise.position_m)

@@ -99,7 +99,7 @@ INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
     tally.facing[1] += along * plain(c.normal.y);
     tally.facing[2] += along * plain(c.normal.z);
 #endif
-#if MESHES
+#if DEEP
     tally.depth += along * plain(c.gap);
 #endif
     tally.impulse[0] += plain(c.impulse.x);

@@ -52,7 +52,7 @@ struct Tally {  // sums over the contacts since the last frame
 #if PAIRED
     Number facing[3];  // normal, weighted by the impulse along it
 #endif
-#if MESHES
+#if DEEP
     Number depth;  // gap, weighted likewise
 #endif
 };

@@ -17,6 +17,7 @@
 #endif
 #define KEEP_LOOP _Pragma("unroll 1")
 #endif
+#define DEEP (MESHES || HULLS)  // labels have gaps weighted by impulses, where slots may have nothing at the frame
 #define PAIR_ROOM (PAIRS > 0 ? PAIRS : 1)  // C++ has no arrays without elements
 // The touching contacts from `first` on, one after another (LISTED), or those that are on, each in its own slot, which
 // keeps them in registers.

@@ -123,6 +123,7 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
             if (k >= contact_count(p)) continue;
             Vec normal = vec(Real(0), Real(0), Real(1)), point;
             Real gap;
+            bool empty = false;  // whether nothing meets in this slot
 #if PAIRED
             if (pair_b(p) >= 0) {
                 Facing facing;
@@ -131,6 +132,7 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
                     normal = facing.normal;
                     point = facing.point;
                 } else {
+                    empty = true;
                     gap = Real(Number(FAR_M));
                     point = none();
 #if TURNED
@@ -180,9 +182,11 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
             bool turned = tally.weight > Number(0) && pushed < Number(0);
             if (turned) normal = facing;
 #endif
+#if DEEP
 #if MESHES
-            bool weighs = pair_b(p) < -1 && surface_kind(-2 - pair_b(p)) == MESH_KIND && tally.weight > Number(0);
-            if (weighs) {
+            empty = empty || (pair_b(p) < -1 && surface_kind(-2 - pair_b(p)) == MESH_KIND);
+#endif
+            if (empty && tally.weight > Number(0)) {
                 normal = facing;
                 gap = Real(tally.depth / tally.weight);
             }

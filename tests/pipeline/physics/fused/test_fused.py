@@ -177,12 +177,16 @@ def planks() -> tuple[World, State]:
 
 
 def test_edges_that_cross(fused: Fused) -> None:
+    """Labels of edges that touched between two frames have the gap and the normal of their impulses."""
     world, state = planks()
-    expected = simulate(world, state, times(0.06), None, True)
-    assert expected.contacts is not None
-    impulse, touches = expected.contacts.impulse_n_s.norm(dim=-1).amax((0, 1)), expected.contacts.body_b == 1
-    assert float(impulse[touches][:16].max()) == 0 < float(impulse[touches][16:].max())
-    agree(expected, fused(world, state, times(0.06), None, True, lanes=None), 1e-7)
+    frames = times(0.08, 25.0)
+    expected = simulate(world, state, frames, None, True)
+    contacts = expected.contacts
+    assert contacts is not None
+    impulse, touches = contacts.impulse_n_s.norm(dim=-1), contacts.body_b == 1
+    assert float(impulse[..., touches][..., :16].max()) == 0 < float(impulse[..., touches][..., 16:].max())
+    assert float(contacts.distance_m[impulse > 0].max()) < 0.01 < float(contacts.distance_m[..., touches].max())
+    agree(expected, fused(world, state, frames, None, True, lanes=None), 1e-7)
 
 
 def test_a_plank_that_lies_across_another_one_rests_on_the_four_points_where_their_edges_cross(fused: Fused) -> None:
