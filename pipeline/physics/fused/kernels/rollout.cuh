@@ -123,7 +123,9 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
             if (k >= contact_count(p)) continue;
             Vec normal = vec(Real(0), Real(0), Real(1)), point;
             Real gap;
+#if DEEP
             bool empty = false;  // whether nothing meets in this slot
+#endif
 #if PAIRED
             if (pair_b(p) >= 0) {
                 Facing facing;
@@ -132,7 +134,9 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
                     normal = facing.normal;
                     point = facing.point;
                 } else {
+#if DEEP
                     empty = true;
+#endif
                     gap = Real(Number(FAR_M));
                     point = none();
 #if TURNED
