@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from ...schemas import Body, Ground, InputDataError, World
 from ...schemas.documents import parse_json
 from ...schemas.imports import ImportResult
+from ..capture.files import entries_of, require_regular_file
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
 from ..io.cells import shown
@@ -80,7 +81,7 @@ def import_pushes(
     Shapes, materials and, for MIT push, the mass are not in the files; the user adds them to the manifest.
 
     Args:
-        source: A .txt (MLab), .json or .h5 (MIT) file, or a folder of them.
+        source: A .txt (MLab), .json or .h5 (MIT) file, a folder of them, or a folder of such folders.
         out: The capture directory to write.
         only: Name of one file without its ending.
         n_train: Number of pushes to fit on; None: 60 %.
@@ -93,9 +94,10 @@ def import_pushes(
         UsageError: If `out` exists, before anything is read.
     """
     with new_directory(out, "capture", overwrite) as directory:
-        files = _chosen(track_files(Path(source), tuple(_READERS)), only)
+        root = Path(source)
+        files = _chosen(_files(root), only)
         recordings, mlab = [], all(path.suffix.lower() == ".txt" for path in files)
-        for path, group in zip(files, episode_names([path.stem for path in files]), strict=True):
+        for path, group in zip(files, episode_names([_group(root, path) for path in files]), strict=True):
             for number, push in enumerate(read_pushes(path)):
                 tracks = from_zero({OBJECT: push.object_track, FINGER: push.finger_track})
                 recordings.append(Recording(name=f"{group}-{number:02d}", tracks=tracks, group=group))
@@ -104,6 +106,11 @@ def import_pushes(
         bodies = (thing, Body(name=FINGER, motion="driven"))
         result = write_recordings(directory, out, World(ground=Ground()), bodies, recordings, splits)
     said = "the files have no shapes, materials and heights of the ground: add them to capture.toml before a fit."
+    if mlab:
+        said += (
+            " The object has a pose before and one after each push alone, which 'cgwm fit' does not take: "
+            "benchmarks/pushes.py fits friction and face_exponent to them."
+        )
     return result.model_copy(update={"warnings": (said,)})
 
 
@@ -114,6 +121,20 @@ def read_pushes(path: Path) -> list[Push]:
         InputDataError: If it is not such data.
     """
     return _READERS[path.suffix.lower()](path)
+
+
+def _files(source: Path) -> list[Path]:
+    """Return the files of a source; of a folder without any, those of its folders: MLab has one for each support."""
+    inner = [path for path in entries_of(source) if path.is_dir()] if source.is_dir() else []
+    if not inner or any(path.suffix.lower() in _READERS for path in entries_of(source)):
+        return track_files(source, tuple(_READERS))
+    found = [path for folder in inner for path in entries_of(folder) if path.suffix.lower() in _READERS]
+    return [require_regular_file(path) for path in found] or track_files(source, tuple(_READERS))
+
+
+def _group(source: Path, file: Path) -> str:
+    """Return the name of a file's group: that of the file, after that of the folder within the source."""
+    return file.stem if file.parent in (source, source.parent) else f"{file.parent.name}_{file.stem}"
 
 
 def _chosen(files: list[Path], only: str | None) -> list[Path]:

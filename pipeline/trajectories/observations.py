@@ -294,6 +294,13 @@ def track_episodes(capture: Capture, split: str) -> list[Episode]:
     return usable
 
 
+_MILLISECONDS = "if these are milliseconds, they do not match the column time_s."
+_FOR_PUSHES = (
+    "track the body during the motion, or write time_s in seconds if these are milliseconds; of pushes with the poses "
+    "before and after alone, benchmarks/pushes.py fits friction and face_exponent (docs/real-data.md)."
+)
+
+
 def refuse_slow_times(episodes: Sequence[Episode], bodies: Collection[str], where: str) -> None:
     """Refuse tracks whose frames are too far apart to show a flight.
 
@@ -310,9 +317,10 @@ def refuse_slow_times(episodes: Sequence[Episode], bodies: Collection[str], wher
     step = float(np.median(np.concatenate(list(steps.values())))) if steps else 0.0
     if step > LONGEST_STEP_S:
         slowest = max(steps, key=lambda name: float(np.median(steps[name])))
+        ends = all(len(found) <= len(bodies) for found in steps.values())
         raise InputDataError(
-            f"{where}/tracks/{slowest}.csv: the tracks have a frame every {step:.3g} s; if these are milliseconds, "
-            "they do not match the column time_s.",
+            f"{where}/tracks/{slowest}.csv: the tracks have a frame every {step:.3g} s; "
+            + ("two poses do not show the motion." if ends else _MILLISECONDS),
             f"at most {LONGEST_STEP_S:g} s.",
-            "write time_s in seconds.",
+            _FOR_PUSHES if ends else "write time_s in seconds.",
         )

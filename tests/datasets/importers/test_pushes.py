@@ -83,10 +83,14 @@ def test_what_is_no_push_is_refused(tmp_path: Path) -> None:
 
 
 def test_one_file_of_a_folder(tmp_path: Path) -> None:
-    (tmp_path / "in").mkdir()
+    folder = tmp_path / "all" / "in"
+    folder.mkdir(parents=True)
     for name in ("a", "b"):
-        (tmp_path / "in" / f"{name}.txt").write_text(text_of())
-    assert import_pushes(tmp_path / "in", tmp_path / "both").episodes == 4
-    assert import_pushes(tmp_path / "in", tmp_path / "one", only="b").episodes == 2
+        (folder / f"{name}.txt").write_text(text_of())
+    assert import_pushes(folder, tmp_path / "both").episodes == 4
+    assert import_pushes(folder, tmp_path / "one", only="b").episodes == 2
+    assert import_pushes(folder.parent, tmp_path / "nested", only="a").episodes == 2
+    groups = {entry.group for entry in Capture.open(tmp_path / "nested", check=False).manifest.episodes.values()}
+    assert groups == {"in_a"}
     with pytest.raises(InputDataError, match=r"no file 'c' among a, b\."):
-        import_pushes(tmp_path / "in", tmp_path / "none", only="c")
+        import_pushes(folder, tmp_path / "none", only="c")
