@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from cgwm.pipeline.physics.articulated import Servo, chain_of
 from cgwm.pipeline.physics.chain_state import with_joints
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.engine import rollout
+from cgwm.pipeline.physics.fused import simulate_fused
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.sg_gs.link_spheres import link_spheres
 from torch import Tensor
@@ -92,19 +94,22 @@ def contacts(world: World, state: State, command: JointCommand, seconds: float) 
     return float((found.contacts.impulse_n_s[:, 1:].norm(dim=-1) > 0).sum(-1).double().mean())
 
 
-def measure(world: World, environments: int, seconds: float, device: str, single: bool) -> dict[str, float]:
-    """Return the cost of an environment's sub-step, and what the cube does."""
+def measure(
+    world: World, environments: int, seconds: float, device: str, single: bool, lanes: int | None = None
+) -> dict[str, float]:
+    """Return the cost of an environment's sub-step, and what the cube does; `lanes` are threads of CUDA."""
     state, command = start(world, environments, 0)
     acting = contacts(world, state, command, seconds)
     frames = torch.linspace(0, seconds, 3, dtype=torch.float64)
     kind = torch.float32 if single else torch.float64
     world, state, frames, command = (on_device(x, device, kind) for x in (world, state, frames, command))
     driven = {world.chains[0].name: command}
-    rollout(world, state, frames[:2], driven)
+    roll = rollout if lanes is None else partial(simulate_fused, lanes=lanes)
+    roll(world, state, frames[:2], driven)
     if device == "cuda":
         torch.cuda.synchronize()
     cpu, wall = time.process_time(), time.perf_counter()
-    found = rollout(world, state, frames, driven)
+    found = roll(world, state, frames, driven)
     if device == "cuda":
         torch.cuda.synchronize()
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
@@ -161,12 +166,15 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=0.004)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--single", action="store_true")
+    parser.add_argument("--lanes", type=int, nargs="*", default=[None], help="threads of an environment on CUDA")
     arguments = parser.parse_args()
     for massless in (False, True):
         world = scene(arguments.urdf, arguments.spheres, massless, arguments.step)
         spheres = sum(body.radii.shape[-1] for body in world.bodies)
-        found = measure(world, arguments.environments, arguments.seconds, arguments.device, arguments.single)
-        print(json.dumps({"links": "without mass" if massless else "with mass", "spheres": spheres, **found}))
+        for lanes in arguments.lanes:
+            found = measure(world, arguments.environments, arguments.seconds, arguments.device, arguments.single, lanes)
+            links = "without mass" if massless else "with mass"
+            print(json.dumps({"links": links, "spheres": spheres, "lanes": lanes, **found}), flush=True)
     try:
         print(json.dumps(mujoco_cost(arguments.urdf, arguments.seconds, arguments.step)))
     except ImportError:

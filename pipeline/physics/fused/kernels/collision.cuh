@@ -326,6 +326,55 @@ __device__ bool face(const Problem& problem, const Environment& env, int p, int 
     return true;
 }
 
+struct Frame {  // of one body in that of another: x -> turn x + shift, without derivatives
+    Number turn[9], shift[3];
+};
+
+INLINE Frame frame_in(const Environment& env, int body, int other, const Mat* rotations) {
+    const Mat &R = rotations[body], &Q = rotations[other];
+    const Number rows[9] = {plain(R.x.x), plain(R.x.y), plain(R.x.z), plain(R.y.x), plain(R.y.y),
+                            plain(R.y.z), plain(R.z.x), plain(R.z.y), plain(R.z.z)};
+    const Number columns[9] = {plain(Q.x.x), plain(Q.y.x), plain(Q.z.x), plain(Q.x.y), plain(Q.y.y),
+                               plain(Q.z.y), plain(Q.x.z), plain(Q.y.z), plain(Q.z.z)};
+    Vec away = env.bodies[body].position - R * env.constants[body].com - env.bodies[other].position;
+    Vec at = transposed(Q, away) + env.constants[other].com;
+    Frame frame = {{}, {plain(at.x), plain(at.y), plain(at.z)}};
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) {
+            Number sum = Number(0);
+            for (int k = 0; k < 3; k++) sum += columns[3 * i + k] * rows[3 * k + j];
+            frame.turn[3 * i + j] = sum;
+        }
+    }
+    return frame;
+}
+
+// Whether a sphere is farther than `limit` from the box of another body's spheres, by more than rounding.
+INLINE bool beside(const Constants& other, const Frame& frame, const Number* sphere, Number limit) {
+    Number far2 = Number(0), bound = Number(1 + 1e-5) * (limit + sphere[3] + Number(SMOOTHING_M));
+    for (int i = 0; i < 3; i++) {
+        const Number* row = frame.turn + 3 * i;
+        Number x = row[0] * sphere[0] + row[1] * sphere[1] + row[2] * sphere[2] + frame.shift[i];
+        Number out = greater(other.low[i] - x, x - other.high[i]);
+        if (out > Number(0)) far2 += out * out;
+    }
+    return far2 > bound * bound;
+}
+
+// Whether the box of a body's spheres is beyond a side of that of another body by more than a margin.
+INLINE bool boxes_apart(const Constants& ours, const Constants& other, const Frame& frame, Number margin) {
+    for (int i = 0; i < 3; i++) {
+        Number middle = frame.shift[i], half = margin;
+        for (int j = 0; j < 3; j++) {
+            Number along = frame.turn[3 * i + j];
+            middle += Number(0.5) * along * (ours.low[j] + ours.high[j]);
+            half += Number(0.5) * (along < Number(0) ? -along : along) * (ours.high[j] - ours.low[j]);
+        }
+        if (middle - half > other.high[i] || middle + half < other.low[i]) return true;
+    }
+    return false;
+}
+
 // Finds the contacts of two bodies and distributes the effective mass among them; returns how many touch. The list also
 // has contacts that just opened, because their impulses of the previous step act until the first iteration.
 __device__ int touch_pair(const Problem& problem, Environment& env, int p, const Mat* rotations,
@@ -345,15 +394,26 @@ __device__ int touch_pair(const Problem& problem, Environment& env, int p, const
     if (size(com_a - com_b) - ca.reach - cb.reach - Number(SMOOTHING_M) < limit) {
         int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES, end = contact_count(p);
         Parting parting;
-#if LINKS
-        reveal(env, motions, a);
-        reveal(env, motions, b);
-#endif
+        const Frame frames[2] = {frame_in(env, b, a, rotations), frame_in(env, a, b, rotations)};
+        const Number margin = Number(1 + 1e-5) * (limit + Number(SMOOTHING_M));
+        if (boxes_apart(cb, ca, frames[0], margin) || boxes_apart(ca, cb, frames[1], margin)) end = 0;
 #if HULLS
         // nothing of one hull is nearer to the other one than the gap along the normal that parts them best
-        if (part(problem, env, p, rotations, parting) && parting.gap > limit) end = 0;
+        if (end > 0 && part(problem, env, p, rotations, parting) && parting.gap > limit) end = 0;
 #endif
+#if LINKS
+        if (end > 0) {
+            reveal(env, motions, a);
+            reveal(env, motions, b);
+        }
+#endif
+        const int spheres_of_b = sphere_count(b), spheres_in_all = spheres_of_b + sphere_count(a);
         for (int k = behind; k < end; k += LANES) {
+            if (k < spheres_in_all) {
+                const bool second = k >= spheres_of_b;
+                const Number* sphere = problem.geometry.value + env.geometry + 4LL * problem.spheres[start + k];
+                if (beside(second ? cb : ca, frames[second], sphere, limit)) continue;
+            }
             Facing facing;
             Real weight;
             if (!face(problem, env, p, k, rotations, limit, parting, facing)) continue;

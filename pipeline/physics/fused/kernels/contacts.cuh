@@ -238,10 +238,29 @@ struct Union {  // the spheres of a body, in its frame
     INLINE Real radius(int i) const { return geometry.at(first + 4LL * i + 3); }
 };
 
-INLINE Number gap_to(const Union& spheres, int i, const Number* point) {
+INLINE Number square_to(const Union& spheres, int i, const Number* point) {
     const Number* s = spheres.geometry.value + spheres.first + 4LL * i;
     Number x = point[0] - s[0], y = point[1] - s[1], z = point[2] - s[2];
-    return root(x * x + y * y + z * z) - s[3];
+    return x * x + y * y + z * z;
+}
+
+INLINE Number plain_radius(const Union& spheres, int i) {
+    return spheres.geometry.value[spheres.first + 4LL * i + 3];
+}
+
+// Whether a sphere, the square of whose distance is given, has a gap below `limit`, without a square root.
+INLINE bool below(Number far2, Number radius, Number limit) {
+    Number reach = limit + radius;
+    return reach > Number(0) && far2 < reach * reach;
+}
+
+// Squared distances of a group of spheres, whose computation does not wait for that of the others.
+const int AT_ONCE = 4;
+INLINE void squares_to(const Union& spheres, int first, const Number* point, Number* squares) {
+    SPREAD
+    for (int k = 0; k < AT_ONCE; k++) {
+        squares[k] = square_to(spheres, first + k < spheres.count ? first + k : first, point);
+    }
 }
 
 // Returns whether the union is nearer than `limit`; then also its smooth distance, that of the nearest sphere, and the
@@ -251,29 +270,42 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     const Number width = Number(SMOOTHING_M);
     Number point[3] = {plain(at.x), plain(at.y), plain(at.z)};
     nearest = Number(1e30);
-    for (int i = 0; i < spheres.count; i++) nearest = lesser(nearest, gap_to(spheres, i, point));
+    Number squares[AT_ONCE];
+    for (int first = 0; first < spheres.count; first += AT_ONCE) {
+        squares_to(spheres, first, point, squares);
+        SPREAD
+        for (int k = 0; k < AT_ONCE; k++) {
+            if (first + k >= spheres.count) break;
+            Number radius = plain_radius(spheres, first + k);
+            if (below(squares[k], radius, nearest)) nearest = root(squares[k]) - radius;
+        }
+    }
     if (nearest - width > limit) return false;
-#if HOST
     // only spheres within the width of the nearest one take part: they are found once
     const int most = 64;
     int members[most], found = 0;
     Number gaps[most];
-    for (int i = 0; i < spheres.count && found <= most; i++) {
-        Number gap = gap_to(spheres, i, point) - nearest;
-        if (!(gap < width)) continue;
-        if (found < most) {
-            members[found] = i;
-            gaps[found] = gap;
+    for (int first = 0; first < spheres.count; first += AT_ONCE) {
+        squares_to(spheres, first, point, squares);
+        SPREAD
+        for (int k = 0; k < AT_ONCE; k++) {
+            if (first + k >= spheres.count) break;
+            Number radius = plain_radius(spheres, first + k);
+            if (!below(squares[k], radius, nearest + width)) continue;
+            Number gap = root(squares[k]) - radius - nearest;
+            if (!(gap < width)) continue;
+            if (found < most) {
+                members[found] = first + k;
+                gaps[found] = gap;
+            }
+            found++;
         }
-        found++;
     }
     bool few = found <= most;
 #define EACH_MEMBER for (int m = 0; m < (few ? found : spheres.count); m++)
-#define MEMBER int i = few ? members[m] : m; Number gap = few ? gaps[m] : gap_to(spheres, i, point) - nearest;
-#else
-#define EACH_MEMBER for (int i = 0; i < spheres.count; i++)
-#define MEMBER Number gap = gap_to(spheres, i, point) - nearest;
-#endif
+#define MEMBER                                                                                     \
+    int i = few ? members[m] : m;                                                                  \
+    Number gap = few ? gaps[m] : root(square_to(spheres, i, point)) - plain_radius(spheres, i) - nearest;
     // solve sum over spheres of max(0, t - x)^2 = width^2 for t: Newton from above, where the sum is convex and rising
     Number t = width;
     for (int round = 0; round < 40; round++) {

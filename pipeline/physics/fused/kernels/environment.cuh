@@ -45,6 +45,9 @@ struct Constants {
     Sym inverse_inertia;  // body axes
     Vec com;              // in the body frame
     Number reach;         // of its spheres from the centre of mass
+#if PAIRED
+    Number low[3], high[3];  // box of its spheres, in the body frame
+#endif
 };
 
 struct Tally {  // sums over the contacts since the last frame
@@ -165,10 +168,22 @@ INLINE void load(const Problem& problem, Environment& env) {
         body.spin = table.vector(at + 20);
         at += 23;
         c.reach = Number(0);
+#if PAIRED
+        for (int k = 0; k < 3; k++) {
+            c.low[k] = Number(1e30);
+            c.high[k] = Number(-1e30);
+        }
+#endif
         const Number* sphere = problem.geometry.value + env.geometry + 4LL * sphere_start(b);
         for (int i = 0; i < sphere_count(b); i++, sphere += 4) {
             Number x = sphere[0] - plain(c.com.x), y = sphere[1] - plain(c.com.y), z = sphere[2] - plain(c.com.z);
             c.reach = greater(c.reach, root(x * x + y * y + z * z) + sphere[3]);
+#if PAIRED
+            for (int k = 0; k < 3; k++) {
+                c.low[k] = lesser(c.low[k], sphere[k] - sphere[3]);
+                c.high[k] = greater(c.high[k], sphere[k] + sphere[3]);
+            }
+#endif
         }
         env.cursors[b] = 0;
     }

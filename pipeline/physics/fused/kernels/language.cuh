@@ -4,12 +4,14 @@
 #define EACH_SLOT
 #define EACH_PAIR
 #define EACH_LAW
+#define SPREAD
 #define KEEP_LOOP
 #else
 #define INLINE __device__ __forceinline__
 #define EACH_BODY _Pragma("unroll")
 #define EACH_PAIR _Pragma("unroll 1")
 #define EACH_LAW _Pragma("unroll")
+#define SPREAD _Pragma("unroll")
 #if UNROLLED
 #define EACH_SLOT _Pragma("unroll")
 #else
