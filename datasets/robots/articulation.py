@@ -104,27 +104,9 @@ class Articulation:
         Raises:
             InputDataError: If they are not one tree.
         """
-        carried: dict[str, JointOfRobot] = {}
-        for joint in joints:
-            for end in (joint.parent, joint.link):
-                if end not in links:
-                    raise InputDataError(
-                        f"{path}: joint '{joint.name}' names the link '{end}', which is not there.",
-                        ", ".join(links) + ".",
-                    )
-            if joint.link in carried:
-                raise InputDataError(
-                    f"{path}: link '{joint.link}' is carried by the joints '{carried[joint.link].name}' and "
-                    f"'{joint.name}': a loop.",
-                    "a tree: one joint above each link.",
-                    "leave out the joint that closes the loop.",
-                )
-            carried[joint.link] = joint
-        roots = [link for link in links if link not in carried]
-        if len(roots) != 1:
-            found = "no link is the root: the joints are a ring" if not roots else f"several roots: {', '.join(roots)}"
-            raise InputDataError(f"{path}: {found}.", "one tree of links.", "join the links, or leave out the others.")
-        order, placed = [roots[0]], []
+        carrier = _carriers(path, links, joints)
+        root = _root(path, [link for link in links if link not in carrier])
+        order, placed = [root], []
         for link in order:
             below = [joint for joint in joints if joint.parent == link]
             placed += below
@@ -132,10 +114,7 @@ class Articulation:
         if len(order) != len(links):
             lost = next(link for link in links if link not in order)
             raise InputDataError(f"{path}: link '{lost}' hangs in a ring of joints.", "one tree of links.")
-        if len({joint.name for joint in placed}) < len(placed):
-            names = [joint.name for joint in placed]
-            twice = next(one for one in names if names.count(one) > 1)
-            raise InputDataError(f"{path}: several joints are called '{twice}'.", "a name of its own for each joint.")
+        _require_own_names(path, [joint.name for joint in placed])
         return Articulation(name=name, path=path, links=tuple(links[link] for link in order), joints=tuple(placed))
 
     def require_limits(self) -> None:
@@ -212,3 +191,51 @@ def _merged(carrier: LinkOfRobot, link: LinkOfRobot, turn: Array, shift: Array) 
         inertia = inertia + weight * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     parts = [replace(p, rotation=turn @ p.rotation, position_m=shift + turn @ p.position_m) for p in link.geometry]
     return replace(carrier, mass_kg=mass, com_m=centre, inertia_kg_m2=inertia, geometry=(*carrier.geometry, *parts))
+
+
+def _carriers(path: Path, links: dict[str, LinkOfRobot], joints: list[JointOfRobot]) -> dict[str, JointOfRobot]:
+    """Return the joint above each link that has one.
+
+    Raises:
+        InputDataError: If a joint names no link, or a link has several joints above it.
+    """
+    above: dict[str, JointOfRobot] = {}
+    for joint in joints:
+        for end in (joint.parent, joint.link):
+            if end not in links:
+                raise InputDataError(
+                    f"{path}: joint '{joint.name}' names the link '{end}', which is not there.",
+                    ", ".join(links) + ".",
+                )
+        if joint.link in above:
+            raise InputDataError(
+                f"{path}: link '{joint.link}' is carried by the joints '{above[joint.link].name}' and "
+                f"'{joint.name}': a loop.",
+                "a tree: one joint above each link.",
+                "leave out the joint that closes the loop.",
+            )
+        above[joint.link] = joint
+    return above
+
+
+def _root(path: Path, roots: list[str]) -> str:
+    """Return the only link that no joint carries.
+
+    Raises:
+        InputDataError: If there is none, or several.
+    """
+    if len(roots) != 1:
+        found = "no link is the root: the joints are a ring" if not roots else f"several roots: {', '.join(roots)}"
+        raise InputDataError(f"{path}: {found}.", "one tree of links.", "join the links, or leave out the others.")
+    return roots[0]
+
+
+def _require_own_names(path: Path, names: list[str]) -> None:
+    """Check that no two joints have one name.
+
+    Raises:
+        InputDataError: If two have.
+    """
+    if len(set(names)) < len(names):
+        twice = next(one for one in names if names.count(one) > 1)
+        raise InputDataError(f"{path}: several joints are called '{twice}'.", "a name of its own for each joint.")

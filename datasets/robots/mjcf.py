@@ -56,36 +56,9 @@ def _append(
 ) -> None:  # fmt: skip
     """Append the links and joints of a body; `ends` has for each body its last link and that link's place in it."""
     name = model.body(body).name or f"body{body}"
-    numbers = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
-    kinds = [int(model.jnt_type[number]) for number in numbers]
-    root = model.body_parentid[body] == 0
-    wrong = [kind for kind in kinds if kind not in (2, 3) and not (root and kind == 0)]
-    if wrong:
-        joint = model.joint(numbers[kinds.index(wrong[0])]).name
-        raise InputDataError(
-            f"{path}: joint '{joint}' is a {'ball' if wrong[0] == 1 else 'free'} joint.",
-            "hinge, slide; free for the root.",
-            "model a ball joint by three hinges.",
-        )
-    moving = [number for number, kind in zip(numbers, kinds, strict=True) if kind != 0]
-    if root and (moving or kinds):
-        parent, place = "", np.zeros(3)
-        if moving:
-            links["world"] = LinkOfRobot(
-                name="world", mass_kg=0.0, com_m=np.zeros(3), inertia_kg_m2=np.zeros((3, 3)), geometry=()
-            )
-            parent = "world"
-    else:
-        parent, place = ("", np.zeros(3)) if root else ends[int(model.body_parentid[body])]
+    moving = _moving_joints(path, model, body)
+    parent, place = _carrier(model, body, bool(moving), links, ends)
     position, quat = model.body_pos[body] - place, model.body_quat[body]
-    anchor = np.zeros(3)
-    for count, number in enumerate(moving):
-        last = count == len(moving) - 1
-        own = name if last else f"{name}/{model.joint(number).name or number}"
-        shift = model.jnt_pos[number] - anchor
-        joints.append(_joint(model, number, parent, own, position + matrix_of(quat) @ shift, quat))
-        links[own] = _link(model, body, own, model.jnt_pos[number] if last else None)
-        parent, position, quat, anchor = own, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), model.jnt_pos[number].copy()
     if not moving:
         links[name] = _link(model, body, name, np.zeros(3))
         if parent:
@@ -95,7 +68,58 @@ def _append(
                     axis=np.array([0.0, 0.0, 1.0]),
                 )
             )  # fmt: skip
+    anchor = np.zeros(3)
+    for number in moving:
+        last = number == moving[-1]
+        own = name if last else f"{name}/{model.joint(number).name or number}"
+        shift = model.jnt_pos[number] - anchor
+        joints.append(_joint(model, number, parent, own, position + matrix_of(quat) @ shift, quat))
+        links[own] = _link(model, body, own, model.jnt_pos[number] if last else None)
+        parent, position, quat, anchor = own, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), model.jnt_pos[number].copy()
     ends[body] = (name, anchor)
+
+
+def _moving_joints(path: Path, model: Any, body: int) -> list[int]:
+    """Return the hinges and slides of a body.
+
+    Raises:
+        InputDataError: If it has another joint, a free one of the root aside.
+    """
+    root = model.body_parentid[body] == 0
+    moving = []
+    for number in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+        kind = int(model.jnt_type[number])
+        if kind in (2, 3):
+            moving.append(number)
+        elif not (root and kind == 0):
+            raise InputDataError(
+                f"{path}: joint '{model.joint(number).name}' is a {'ball' if kind == 1 else 'free'} joint.",
+                "hinge, slide; free for the root.",
+                "model a ball joint by three hinges.",
+            )
+    return moving
+
+
+def _carrier(
+    model: Any, body: int, moving: bool, links: dict[str, LinkOfRobot], ends: dict[int, tuple[str, Array]]
+) -> tuple[str, Array]:
+    """Return the link above a body, "" for none, and its place in the parent body; joints of the root have the world.
+
+    Args:
+        model: The model.
+        body: The body.
+        moving: Whether it has joints that move.
+        links: The links so far, to which the world is added.
+        ends: As in `_append`.
+    """
+    if model.body_parentid[body] != 0:
+        return ends[int(model.body_parentid[body])]
+    if not moving:
+        return "", np.zeros(3)
+    links["world"] = LinkOfRobot(
+        name="world", mass_kg=0.0, com_m=np.zeros(3), inertia_kg_m2=np.zeros((3, 3)), geometry=()
+    )
+    return "world", np.zeros(3)
 
 
 def _joint(model: Any, number: int, parent: str, link: str, position: Array, quat: Array) -> JointOfRobot:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -205,17 +206,15 @@ class World:
         """
         if not self.touching:
             return []
-        solid = [body.radii.shape[-1] > 0 for body in self.bodies]
-        moves = [self.moves(k) and has for k, has in enumerate(solid)]
-        chain = [self.chain_of(k) if self.chains else -1 for k in range(len(self.bodies))]
-        moving = [k for k, does in enumerate(moves) if does]
+        solid = [k for k, body in enumerate(self.bodies) if body.radii.shape[-1] > 0]
+        moving = [k for k in solid if self.moves(k)]
+        chain = {k: self.chain_of(k) if self.chains else -1 for k in solid}
         pairs = [(i, -1) for i in moving if self.ground_normal is not None]
         pairs += [(i, -2 - s) for i in moving for s in range(len(self.surfaces))]
-        for i in range(len(self.bodies)):
-            for j in range(i + 1, len(self.bodies)):
-                apart = chain[i] < 0 or chain[i] != chain[j]
-                if apart and (moves[i] or moves[j]) and solid[i] and solid[j]:
-                    pairs.append((i, j) if moves[i] else (j, i))
+        for i, j in combinations(solid, 2):
+            linked = chain[i] >= 0 and chain[i] == chain[j]
+            if not linked and (i in moving or j in moving):
+                pairs.append((i, j) if i in moving else (j, i))
         return pairs
 
     @property

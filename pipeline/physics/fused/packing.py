@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ...geometry.rotation import quat_multiply, quat_normalize, quat_rotate
 from ..contact_detection import GROUND, edge_slots, pairs_of, slot_count
 from ..contact_law import ContactLaw, coefficients
 from ..fixed_surface import HALF_SPACE, FixedSurface
@@ -19,6 +18,8 @@ from ..pair_laws import laws_in_use
 from ..rigid_body import start
 from ..world import Body, State, World
 from . import tree, wrenches
+from .commands import Commands
+from .layout import in_frame, joined, quat_in_frame, upright
 from .meshes import packed_meshes
 from .structure import Structure
 
@@ -97,56 +98,42 @@ def pack(
     Raises:
         InputDataError: If a driven body has no track.
     """
-    turn = None if world.ground_normal is None else _upright(world.ground_normal)
+    turn = None if world.ground_normal is None else upright(world.ground_normal)
     times = times_s if times_s.ndim == 2 else times_s[None]
-    like = state.position_m.detach()
-    roots = [chain.root for chain in world.chains if chain.base == "driven"]
-    rows = {index: drive_rows(Drive.command(body.name, driven, like), turn) for index, body in enumerate(world.bodies)
-            if body.motion == "driven" or body.name in roots}  # fmt: skip
-    commands = tree.command_rows(world, driven, like)
+    commands = Commands.of(world, driven, state.position_m.detach(), turn)
     effects = wrenches.coefficients(world)
     turned = turn is not None and (len(world.bodies) > 1 or bool(world.surfaces))
     columns = _columns(world, state, turn, turned, effects)
     spheres = [_spheres(body) for body in world.bodies]
     surfaces = [_surface(surface, turn) for surface in world.surfaces]
-    laws, substeps = wrenches.closed_forms(world), world.substeps(times)
-    counts = torch.tensor(substeps, dtype=torch.int32, device=times.device)
-    steps = _steps(laws, times, counts)
-    batch = max(
-        x.shape[0]
-        for x in (
-            *columns, *spheres, *surfaces, steps, *(x for row in (*rows.values(), *commands.values()) for x in row)
-        )
-    )  # fmt: skip
+    counts = torch.tensor(world.substeps(times), dtype=torch.int32, device=times.device)
+    steps = _steps(wrenches.closed_forms(world), times, counts)
+    batch = max(len(x) for x in (*columns, *spheres, *surfaces, steps, *commands.tensors))
     listed, lowest = _listed_spheres(world)
     meshes = packed_meshes(world.surfaces)
-    every = [*rows.values(), *commands.values()]
+    hulls = [row for body in world.bodies for row in _hull_rows(body)]
     return Packed(
         structure=_structure(
             world,
             record=record,
             effects=bool(effects),
             turned=turned,
-            driven=list(rows),
+            driven=commands.bodies,
             lowest=lowest,
             mesh_starts=meshes.starts,
-            commanded=list(commands),
+            commanded=commands.chains,
         ),
         table=torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
         steps=steps,
-        geometry=_joined(
-            [*spheres, *(row for body in world.bodies for row in _hull_rows(body)), *_patch_rows(world)], batch
-        ),
-        surfaces=_joined(surfaces, batch) if surfaces else times.new_zeros(1, 0, 10),
+        geometry=joined([*spheres, *hulls, *_patch_rows(world)], batch),
+        surfaces=joined(surfaces, batch) if surfaces else times.new_zeros(1, 0, 10),
         mesh_numbers=meshes.numbers.to(times),
         mesh_indices=meshes.indices.to(times.device),
-        drives=_joined([row for row, _ in every], batch) if every else times.new_zeros(1, 0, 14),
+        drives=commands.samples(batch, times),
         substeps=counts,
         spheres=listed,
-        drive_starts=_drive_starts(every, times),
-        drive_last=_joined([last[:, None] for _, last in every], batch).to(torch.int32)
-        if every
-        else counts.new_zeros(1, 0),
+        drive_starts=commands.starts(times),
+        drive_last=commands.last(batch, counts),
         turn=turn,
     )
 
@@ -239,11 +226,11 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
     """Return the columns of the table: first those of the world, then those of each body."""
     zero = torch.zeros_like(world.gravity[:, :1])
     offset = zero if world.ground_offset is None else world.ground_offset[:, None]
-    columns = [_turned(turn, world.gravity), offset]
+    columns = [in_frame(turn, world.gravity), offset]
     columns += [law.friction[:, None] for law in wrenches.closed_forms(world)]
     if turned and turn is not None:
         columns.append(turn[None])
-    columns += [_turned(turn, effect) if effect.shape[-1] == 3 else effect for effect in effects]
+    columns += [in_frame(turn, effect) if effect.shape[-1] == 3 else effect for effect in effects]
     columns += tree.columns(world, state)
     for index, body in enumerate(world.bodies):
         position, quat, velocity = (x[:, index] for x in (state.position_m, state.quat_wxyz, state.velocity_m_s))
@@ -259,24 +246,8 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
             if body.motion == "link":
                 velocity, spin = tree.link_motion(world, index, state)
             columns += [zero, zero.expand(-1, 6), zero.expand(-1, 3)]
-        columns += [_turned(turn, position), _turned_quat(turn, quat), _turned(turn, velocity), _turned(turn, spin)]
+        columns += [in_frame(turn, position), quat_in_frame(turn, quat), in_frame(turn, velocity), in_frame(turn, spin)]
     return columns
-
-
-def drive_rows(drive: Drive, turn: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the samples (1 or B, S, 14) of a command, and the index of its last interval (1 or B,)."""
-    # the velocities go from a sample to the next; the last sample has none
-    parts = (
-        drive.times_s[..., None], _turned(turn, drive.position_m), _turned_quat(turn, drive.quat_wxyz),
-        _turned(turn, drive.velocity_m_s), _turned(turn, drive.omega_world_rad_s),
-    )  # fmt: skip
-    return torch.cat(parts, -1), drive.last
-
-
-def _drive_starts(rows: Sequence[tuple[Tensor, Tensor]], like: Tensor) -> Tensor:
-    lengths = [row.shape[1] for row, _ in rows]
-    starts = [sum(lengths[:index]) for index in range(len(lengths))]
-    return torch.tensor(starts, dtype=torch.int32, device=like.device)
 
 
 def _spheres(body: Body) -> Tensor:
@@ -287,7 +258,7 @@ def _spheres(body: Body) -> Tensor:
 
 def _surface(surface: FixedSurface, turn: Tensor | None) -> Tensor:
     """Return pose in the kernel's frame and size of a surface, shape (1 or B, 1, 10)."""
-    parts = (_turned(turn, surface.position), _turned_quat(turn, surface.quat_wxyz), surface.size)
+    parts = (in_frame(turn, surface.position), quat_in_frame(turn, surface.quat_wxyz), surface.size)
     batch = max(part.shape[0] for part in parts)
     return torch.cat([part.expand(batch, -1) for part in parts], -1)[:, None]
 
@@ -401,26 +372,3 @@ def _with_lowest(world: World, starts: list[int], listed: Tensor) -> tuple[Tenso
         lowest.append((len(listed), len(rows)))
         listed = torch.cat((listed, rows))
     return listed, tuple(lowest)
-
-
-def _joined(parts: list[Tensor], batch: int) -> Tensor:
-    """Concatenate along the second dimension; the first is 1 where it is 1 for all parts, else the batch."""
-    shared = all(part.shape[0] == 1 for part in parts)
-    return torch.cat([part if shared else part.expand(batch, *part.shape[1:]) for part in parts], 1)
-
-
-def _upright(normal: Tensor) -> Tensor | None:
-    """Return the rotation (4,) that takes the ground's normal to z; None where it is z."""
-    x, y, z = normal.detach().tolist()
-    if (x, y) == (0.0, 0.0) and z > 0:
-        return None
-    axis = [0.0, 1.0, 0.0, 0.0] if z < -1 + 1e-12 else [1 + z, y, -x, 0.0]
-    return quat_normalize(normal.new_tensor(axis))
-
-
-def _turned(turn: Tensor | None, vector: Tensor) -> Tensor:
-    return vector if turn is None else quat_rotate(turn, vector)
-
-
-def _turned_quat(turn: Tensor | None, quat: Tensor) -> Tensor:
-    return quat if turn is None else quat_multiply(turn, quat)

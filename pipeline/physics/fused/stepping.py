@@ -14,8 +14,9 @@ from ..effects.effect import changed_by_effects
 from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..world import State, World
+from .commands import drive_rows
 from .launch import launch
-from .packing import Packed, drive_rows, pack
+from .packing import Packed, pack
 from .rollout import FRAME_WIDTH, Launch, read_frames, require_one_kind, unsupported
 from .structure import BODY_COLUMNS, MOTION_COLUMNS, lanes_for
 

@@ -31,6 +31,28 @@ _BUSY_THREADS = 262_144
 _FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
 """Number of contacts that fit into the registers of a thread, by (single precision, with derivatives)."""
 
+_NUMBERS: dict[str, float] = {
+    "SMOOTHING_M": PAIR_SMOOTHING_M,
+    "SAME_PLANE_M": SAME_PLANE_M,
+    "SAME_NORMAL": SAME_NORMAL,
+    "OVERHANG_M": OVERHANG_M,
+    "LEAST_CROSSING": LEAST_CROSSING,
+    "OUT_OF_FACE": OUT_OF_FACE,
+    "PARALLEL": PARALLEL,
+    "MOST_PLANES": MOST_PLANES,
+    "ONSET_M": CONTACT_ONSET_M,
+    "LEAST_MOBILITY": LEAST_MOBILITY,
+    "NEWTON_STEPS": NEWTON_STEPS,
+    "FLATTEST": FLATTEST,
+    **{f"ORDER_{axis}": value for axis, value in zip("XYZ", ORDER, strict=True)},
+    "FLAT_SINE": FLAT,
+    "FAR_M": FAR_M,
+    "LEAST_FRICTION": LEAST,
+    "CLOSE": CLOSE,
+    "LIMIT_TIME_S": LIMIT_TIME_S,
+}
+"""Numbers of the contact engine that the kernels share with torch."""
+
 _FILES = (
     "arithmetic",  # dual numbers, vectors and rotations, and sums over the threads of an environment
     "surface",  # effects of the contact between one body and the ground: formulas of physics/effects
@@ -142,11 +164,19 @@ class Structure:
 
     def source(self, host: bool = False) -> str:
         """Return the source: constants, then the files of `kernels/`; for the host without the kernel entry."""
-        paired = self.paired
         tree = self.tree or Tree()
+        flags = [f"#define {name} {int(value)}" for name, value in (self._flags(host) | _tree_flags(tree)).items()]
+        numbers = [f"#define {name} {value!r}" for name, value in _NUMBERS.items()]
+        functions = [_function(name, values) for name, values in (self._lists() | self._tree_lists(tree)).items()]
+        texts = (kernel_file("language"), *functions, *tree.lists(), *map(kernel_file, _FILES))
+        return "\n".join((*flags, *numbers, *texts))
+
+    def _flags(self, host: bool) -> dict[str, int]:
+        """Return the constants by name, those of chains aside."""
+        paired = self.paired
         alone = host and self.lanes == 1  # one thread of a CPU, whose arrays lie in its cache
         held = not paired and (alone or self._fits_registers)
-        constants = {
+        return {
             "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
             "RECORD": self.record, "EFFECTS": self.effects, "MAGNETS": self.magnets,
             "TWISTED": self.twisted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic, "TURNED": self.turned,
@@ -158,22 +188,12 @@ class Structure:
             "HULLS": paired and any(faces for _, faces, *_ in self.hulls),
             "PATCHES": bool(self.areas),
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
-            "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
-            "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
         }  # fmt: skip
-        lines = [f"#define {name} {int(value)}" for name, value in constants.items()]
-        lines += [f"#define SMOOTHING_M {PAIR_SMOOTHING_M!r}", f"#define SAME_PLANE_M {SAME_PLANE_M!r}"]
-        lines += [f"#define SAME_NORMAL {SAME_NORMAL!r}", f"#define OVERHANG_M {OVERHANG_M!r}"]
-        lines += [f"#define LEAST_CROSSING {LEAST_CROSSING!r}", f"#define OUT_OF_FACE {OUT_OF_FACE!r}"]
-        lines += [f"#define PARALLEL {PARALLEL!r}", f"#define MOST_PLANES {MOST_PLANES}"]
-        lines += [f"#define ONSET_M {CONTACT_ONSET_M!r}", f"#define LEAST_MOBILITY {LEAST_MOBILITY!r}"]
-        lines += [f"#define NEWTON_STEPS {NEWTON_STEPS}", f"#define FLATTEST {FLATTEST!r}"]
-        lines += [f"#define ORDER_{axis} {value!r}" for axis, value in zip("XYZ", ORDER, strict=True)]
-        lines += [f"#define FLAT_SINE {FLAT!r}", f"#define FAR_M {FAR_M!r}"]
-        lines += [f"#define LEAST_FRICTION {LEAST!r}", f"#define CLOSE {CLOSE!r}"]
-        lines += [f"#define LIMIT_TIME_S {LIMIT_TIME_S!r}"]
-        lists = {
+
+    def _lists(self) -> dict[str, Iterable[int]]:
+        """Return the lists by name."""
+        lists: dict[str, Iterable[int]] = {
             "is_free": self.free, "drive_number": self.drives, "sphere_count": self.spheres,
             "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
             "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
@@ -182,13 +202,23 @@ class Structure:
             "surface_kind": self.surfaces, "mesh_number_start": [start for start, _ in self.mesh_starts],
             "mesh_index_start": [start for _, start in self.mesh_starts],
             "low_start": [start for start, _ in self.lowest], "low_count": [count for _, count in self.lowest],
-            "group_of": tree.groups(self.free),
-            "body_link": [tree.bodies.index(b) if b in tree.bodies else -1 for b in range(len(self.free))],
         }  # fmt: skip
         for index, name in enumerate(("hull_start", "face_count", "edge_count", "support_count", "ridge_count")):
             lists[name] = [hull[index] for hull in self.hulls]
-        functions = [_function(name, values) for name, values in lists.items()] + tree.lists()
-        return "\n".join((*lines, kernel_file("language"), *functions, *map(kernel_file, _FILES)))
+        return lists
+
+    def _tree_lists(self, tree: Tree) -> dict[str, Iterable[int]]:
+        """Return the lists of chains that have one entry for each body."""
+        links = [tree.bodies.index(body) if body in tree.bodies else -1 for body in range(len(self.free))]
+        return {"group_of": tree.groups(self.free), "body_link": links}
+
+
+def _tree_flags(tree: Tree) -> dict[str, int]:
+    """Return the constants of chains by name."""
+    return {
+        "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
+        "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy,
+    }  # fmt: skip
 
 
 def kernel_file(name: str) -> str:
