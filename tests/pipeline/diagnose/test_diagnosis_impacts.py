@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -13,13 +15,13 @@ from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.verdict import find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics import State, World
-from cgwm.pipeline.physics.contact_law import restitution
+from cgwm.pipeline.physics.contact_law import Touch, restitution
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION
 from cgwm.pipeline.segments.candidates import Candidate, variants_of
 from cgwm.pipeline.segments.impact_fit import BASE, ImpactBase, ImpactProblem, fit_impacts
-from cgwm.pipeline.segments.impact_law import Impact, after_impact, point_velocity, rebound_speed, within_cone
+from cgwm.pipeline.segments.impact_law import Impact, _cone, after_impact, point_velocity, rebound_speed, within_cone
 from cgwm.pipeline.segments.impact_velocities import Impacts, measured_impacts
 from cgwm.pipeline.segments.prepare import Prepared, prepare
 from helpers.diagnosis_data import NOISE, Effects, tosses, world_with
@@ -121,6 +123,23 @@ def test_effects_are_asked_for_the_rebound() -> None:
     speed, bounce = -one.before[:, 2], bare / -one.before[:, 2]
     expected = (bounce.square() * (speed.square() + work) - work).sqrt()
     assert rebound_speed(one, law(contact_time_s=1e-4), [sticky]).tolist() == pytest.approx(expected.tolist(), rel=0.01)
+
+
+def test_a_slow_spin_is_stopped_and_not_reversed() -> None:
+    """Friction against spinning takes c_t J from the angular momentum about the normal, down to none."""
+    effects = [ActiveEffect.of(load_effect("torsional_friction"), {"c_t": 1e-4})]
+    one = impact([[0.0, 0.0, -1.0, 0.0, 0.0, spin] for spin in (0.9, -0.9, 0.2)])
+    spins = after_impact(one, law(), effects)[:, 5]
+    change = 1e-4 * float(one.impulse[0]) / (0.4 * MASS * RADIUS**2)
+    assert 0.2 < change < 0.9
+    assert spins.tolist() == pytest.approx([0.9 - change, change - 0.9, 0.0])
+
+
+def test_the_grain_of_friction_keeps_its_mean() -> None:
+    """M = mu I + [[a, b], [b, -a]]: the friction at right angles is less by what it is more along the grain."""
+    touch = SimpleNamespace(friction=torch.tensor([0.4]), anisotropy=torch.tensor([[[0.1, 0.05]]]))
+    expected = torch.tensor([[[0.5, 0.05], [0.05, 0.3]]])
+    assert torch.allclose(_cone(cast(Touch, touch))[:, None], expected[:, None])
 
 
 def test_an_oblique_slip_turns_where_friction_has_a_grain() -> None:

@@ -177,3 +177,25 @@ def test_a_flight_under_a_strange_force_is_no_support() -> None:
     light = replace(world_with("ball"), gravity=world_with("ball").gravity / 3)
     world, episodes = world_with("ball"), tosses(light, 3, count=4, duration_s=0.4, height_m=(0.8, 1.0))
     assert not bool(prepare(world, episodes).supported.any())
+
+
+def test_times_in_another_unit_are_refused_before_anything_else() -> None:
+    world = world_with("ball")
+    slow = changed(tosses(world, 3, count=2, duration_s=0.3), lambda track: replace(track, time_s=1e3 * track.time_s))
+    with pytest.raises(InputDataError, match="time"):
+        check_units_and_geometry(world, slow, "capture")
+
+
+def test_the_largest_moment_of_inertia_has_to_fit_into_the_shape() -> None:
+    """A ball of radius r has at most m r^2; the other two moments may be possible."""
+    world = world_with("ball")
+    body = world.bodies[0]
+    most = float(body.mass[0]) * float(body.radii.max()) ** 2
+    for share, fits in ((0.9, True), (1.1, False)):
+        moments = torch.diag(most * torch.tensor([0.6, 0.7, share], dtype=torch.float64))[None]
+        other = world.with_body(0, inertia=moments.to(body.inertia))
+        if fits:
+            check_units_and_geometry(other, tosses(world, 3, count=1, duration_s=0.3), "capture")
+        else:
+            with pytest.raises(InputDataError, match="moments of inertia"):
+                check_units_and_geometry(other, tosses(world, 3, count=1, duration_s=0.3), "capture")

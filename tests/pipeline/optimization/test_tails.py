@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cgwm.pipeline.optimization.importance_sampling import _moments
 from cgwm.pipeline.optimization.uncertainty import chi2_tail, correlation_of, f_tail, normal_tail, student_quantile
 from scipy import stats
 
@@ -25,3 +26,12 @@ def test_parameters_that_do_the_same_are_correlated_by_no_more_than_1() -> None:
     # nor one that rounding has left different on the two sides of the diagonal
     matrix = correlation_of(["a", "b"], np.array([[4.0, -2.0], [-1.96, 1.0]])).matrix
     assert matrix[0][1] == matrix[1][0] == pytest.approx(-0.99)
+
+
+def test_moments_of_weighted_samples() -> None:
+    rng = np.random.default_rng(0)
+    samples, weight = rng.normal(3.0, 1.0, (40, 3)), rng.uniform(0, 1, 40)
+    weight /= weight.sum()
+    mean, covariance = _moments(samples, weight)
+    assert mean == pytest.approx(np.average(samples, axis=0, weights=weight))
+    assert covariance == pytest.approx(np.cov(samples.T, aweights=weight, ddof=0))

@@ -379,3 +379,40 @@ def test_parameters_of_a_chain_keep_its_mass_and_scale_what_they_name() -> None:
     np.testing.assert_allclose(radius[1] / radius[0], [1.0, 3.0], rtol=1e-14)
     np.testing.assert_allclose(found.chains[0].joints[1].friction, [0.1, 0.2])
     assert found.chains[0].joints[0].friction is world.chains[0].joints[0].friction
+
+
+def test_only_a_free_base_needs_no_joint_that_moves() -> None:
+    """A rigid pair that floats moves as one; behind a fixed root nothing would."""
+    joint = Joint.of("weld", "fixed", "upper", "base", position_m=(0.1, 0, 0))
+    require_chains(chained(Chain(name="pair", root="base", base="free", joints=(joint,)), link("base"), link("upper")))
+    alone = chained(Chain(name="pair", root="base", base="free", joints=()), link("base"))
+    welded = chained(Chain(name="pair", root="base", base="fixed", joints=(joint,)), link("base"), link("upper"))
+    for world in (alone, welded):
+        with pytest.raises(InputDataError, match="none of its joints moves"):
+            require_chains(world)
+
+
+@pytest.mark.parametrize("kind", ["hinge", "slide"])
+def test_losses_of_joints_start_at_a_share_of_what_gravity_does_there(kind: str) -> None:
+    """Of a hinge: m g r and its pendulum's frequency sqrt(g / r); of a slide: m g and a fall by r."""
+    body = link("arm", 0.3)
+    joint = Joint.of("joint", kind, "arm", "base", axis=(0, 1, 0))
+    chain = Chain(name="one", root="base", base="fixed", joints=(joint,))
+    found = {p.name: p for p in chain_parameters(chained(chain, link("base", 0.0), body))}
+    mass, com2 = 0.3, float(body.com.square().sum())
+    arm = math.sqrt(com2 + float(body.inertia[0].diagonal().sum()) / 2 / mass)
+    weight = mass * 9.81 * (arm if kind == "hinge" else 1.0)
+    rate = math.sqrt(9.81 / arm) if kind == "hinge" else math.sqrt(9.81 * arm)
+    friction, damping = found["joint.friction"], found["joint.damping"]
+    assert friction.unit == ("N m" if kind == "hinge" else "N")
+    assert damping.unit == ("N m s/rad" if kind == "hinge" else "N s/m")
+    assert friction.bounds[1] == pytest.approx(10 * weight, rel=1e-3)
+    assert damping.bounds[1] == pytest.approx(10 * weight / rate, rel=1e-3)
+
+
+def test_a_repeated_command_has_the_rows_of_the_batch() -> None:
+    values = torch.tensor([[[0.0], [1.0]], [[0.5], [0.2]]], dtype=F64)
+    command = JointCommand.targets(torch.tensor([[0.0, 1.0], [0.0, 2.0]], dtype=F64), values)
+    again = command.repeat(3)
+    assert again.coefficients.shape == (6, *command.coefficients.shape[1:])
+    assert torch.equal(again.coefficients[2:4], command.coefficients)

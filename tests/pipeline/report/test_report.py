@@ -11,7 +11,15 @@ from cgwm.cli import demo
 from cgwm.pipeline.demo.page import ReportPictures, write_report
 from cgwm.pipeline.demo.truth_tables import sphere_distance, true_parameters
 from cgwm.pipeline.demo.verdict import targets_of, verdict_text
-from cgwm.pipeline.rendering.contact_sheets import FrameStrip, RolloutTile, small_png, telling, tiles
+from cgwm.pipeline.rendering.contact_sheets import (
+    FrameStrip,
+    RolloutTile,
+    _fitted,
+    _window,
+    small_png,
+    telling,
+    tiles,
+)
 from cgwm.pipeline.report.charts import Chart, Line, chart_svg, decades, interval_svg
 from cgwm.pipeline.report.page import command, link, number, section, table
 from cgwm.pipeline.report.page import page as whole
@@ -307,6 +315,24 @@ def test_a_picture_is_made_to_fit() -> None:
     data = small_png(noisy, 60_000)
     assert len(data) <= 60_000
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
+
+
+def test_a_picture_of_another_shape_lies_in_the_middle_of_its_tile() -> None:
+    tile = _fitted(np.zeros((10, 40, 3), np.uint8), (80, 60))
+    dark = tile.sum(-1) == 0
+    rows, columns = np.nonzero(dark)
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (20, 39, 0, 79)
+    assert dark[20:40].all() and (tile[~dark] == 255).all()
+
+
+def test_the_window_holds_what_moves_with_a_margin() -> None:
+    masks = np.zeros((2, 120, 160), np.uint8)
+    masks[0, 40:60, 30:40], masks[1, 50:70, 50:60] = 1, 1
+    frames = np.zeros((2, 120, 160, 3), np.uint8)
+    strip = FrameStrip(episode="0", camera="c", times_s=np.arange(2.0), real=frames, predicted=frames, masks=masks)
+    left, top, width, height = _window(strip)
+    assert (width, height) == (56, 42)  # 30 by 30 pixels and a fifth at each side, at 4:3
+    assert (left + width / 2, top + height / 2) == (45, 55)
 
 
 def test_charts_break_where_values_are_missing() -> None:

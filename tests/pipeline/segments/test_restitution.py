@@ -8,6 +8,7 @@ import torch
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.phys_geo.tracks.contact_fit import RestitutionFit, damping_of, restitution_of
 from cgwm.pipeline.physics.contact_law import restitution
+from cgwm.pipeline.segments.restitution_fit import DRAG_PRIOR, SHAKEN_S, _Flight, _Noise, _Solved
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from helpers.worlds import ball_body, world_of
 
@@ -88,3 +89,45 @@ def test_a_ball_that_does_not_turn_at_the_ground_has_no_bounce() -> None:
     for position in (falling, rolling, turning):
         track = Track(time_s=time, position_m=position, quat_wxyz=None)
         assert restitution_of(world, whole_episodes(world, [Episode("0", {"ball": track})])) is None
+
+
+def test_errors_of_heights_have_their_covariance() -> None:
+    """White and slow noise, the scatter of a flight's own acceleration, and after an impact the ball's own shaking."""
+    noise = _Noise(white_m=2e-3, slow_m=3e-3, time_s=0.05, lift_m_s2=0.4, shaken_m=5e-3)
+    time = np.array([0.02, 0.05, 0.11])
+    a, b = time[:, None], time[None]
+    plain = 4e-6 * np.eye(3) + 9e-6 * np.exp(-np.abs(a - b) / 0.05) + 0.16 * (a**2 / 2) * (b**2 / 2)
+    shaken = 25e-6 * np.exp(-2 * np.maximum(a, b) / SHAKEN_S)
+    assert noise.covariance(time) == pytest.approx(plain + shaken, rel=1e-6)
+    assert noise.covariance(-time) == pytest.approx(plain, rel=1e-6)  # before the impact nothing shakes it
+
+
+def test_flights_are_solved_as_one_linear_model() -> None:
+    """States of all flights and a common drag with its prior: the normal equations of the whole, and its likelihood."""
+    rng = np.random.default_rng(1)
+    noise = _Noise(white_m=2e-3, slow_m=1e-3, time_s=0.05, lift_m_s2=0.3, shaken_m=2e-3)
+    flights = []
+    for count in (6, 9, 9):
+        time = np.sort(rng.uniform(0.01, 0.2, count))
+        basis = np.column_stack([np.ones(count), time])
+        flights.append(_Flight(time=time, height=rng.normal(0, 0.01, count), basis=basis, drag=-3 * time**2))
+    found = _Solved.of(flights, noise)
+    size = sum(len(flight.time) for flight in flights)
+    design, cover, row = np.zeros((size, 7)), np.zeros((size, size)), 0
+    for k, flight in enumerate(flights):
+        rows = slice(row, row + len(flight.time))
+        design[rows, 2 * k : 2 * k + 2], design[rows, 6] = flight.basis, flight.drag
+        cover[rows, rows] = noise.covariance(flight.time)
+        row += len(flight.time)
+    height = np.concatenate([flight.height for flight in flights])
+    weight = np.linalg.inv(cover)
+    normal = design.T @ weight @ design
+    normal[6, 6] += 1 / DRAG_PRIOR**2
+    solution = np.linalg.solve(normal, design.T @ weight @ height)
+    drag = found.drag[0]
+    assert drag == pytest.approx(solution[6])
+    assert found.drag[1] == pytest.approx(np.linalg.inv(normal)[6, 6])
+    assert (found.states - drag * found.slopes).ravel() == pytest.approx(solution[:6])
+    left = height - design @ solution
+    cost = np.linalg.slogdet(cover)[1] + np.linalg.slogdet(normal)[1] + left @ weight @ left + (drag / DRAG_PRIOR) ** 2
+    assert found.cost == pytest.approx(cost)

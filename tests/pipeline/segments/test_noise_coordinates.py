@@ -1,0 +1,28 @@
+"""Coordinates in which slow errors are fitted, and the odds of a force that repeats."""
+
+import numpy as np
+import pytest
+from cgwm.pipeline.segments.repeated_forces import RepeatedForce
+from cgwm.pipeline.segments.slow_errors import _coded, _decoded  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.trajectories.innovations import CorrelatedNoise
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_coordinates_of_noise_give_it_back(share: float) -> None:
+    noise = CorrelatedNoise(share=share, time_s=0.012, size=1.1, slow=0.8, slow_time_s=0.3, sway=2.5)
+    more = [np.log(noise.slow), np.log(noise.slow_time_s), np.log(noise.sway)]
+    found = _decoded(np.array([*_coded(noise), *more]), ("slow", "sway"), noise.level)
+    assert found[:-1] == pytest.approx(noise[:-1]) and found.level == noise.level
+
+
+@pytest.mark.parametrize("gains", [(40.0,), (-9.0, 4.0, 5.0), (-9.0, -10.0, -11.0)])
+def test_what_one_episode_or_no_gain_shows_is_no_repeated_force(gains: tuple[float, ...]) -> None:
+    assert RepeatedForce(coordinate="x", frame="world", gains=gains).p_value == 1.0
+
+
+def test_the_best_of_several_laws_has_their_odds() -> None:
+    """Student's t of 4, 5, 6: 5 / (1 / sqrt 3) = 8.66 with 2 degrees of freedom, p = 0.00654."""
+    one = RepeatedForce(coordinate="x", frame="world", gains=(4.0, 5.0, 6.0))
+    assert one.p_value == pytest.approx(0.00654, rel=1e-3)
+    three = RepeatedForce(coordinate="x", frame="world", gains=(4.0, 5.0, 6.0), tried=3)
+    assert three.p_value == pytest.approx(3 * one.p_value)
