@@ -48,6 +48,12 @@ _PUBLIC = {
     "import_pinwm": ".datasets.importers.pinwm",
     "import_rosbag": ".datasets.importers.rosbag",
     "import_tum": ".datasets.importers.tum",
+    "import_record3d": ".datasets.importers.phone_scans",
+    "import_polycam": ".datasets.importers.phone_scans",
+    "import_nerfstudio": ".datasets.importers.posed_photos",
+    "import_colmap": ".datasets.importers.posed_photos",
+    "import_video": ".datasets.importers.walk_video",
+    "import_photos": ".datasets.importers.photo_folder",
     "improve": ".pipeline.improve",
     "merge": ".pipeline.synthesize",
     "open_view": ".pipeline.view",
@@ -72,10 +78,14 @@ if TYPE_CHECKING:
     from .datasets.importers.elbow import import_elbow
     from .datasets.importers.hdf5_tracks import import_hdf5
     from .datasets.importers.jugglebot import import_jugglebot
+    from .datasets.importers.phone_scans import import_polycam, import_record3d
+    from .datasets.importers.photo_folder import import_photos
     from .datasets.importers.pinwm import import_pinwm
+    from .datasets.importers.posed_photos import import_colmap, import_nerfstudio
     from .datasets.importers.pushes import import_pushes
     from .datasets.importers.rosbag import import_rosbag
     from .datasets.importers.tum import import_tum
+    from .datasets.importers.walk_video import import_video
     from .datasets.models import Model, read_model
     from .pipeline.calibrate import calibrate
     from .pipeline.compare import compare
@@ -147,15 +157,21 @@ __all__ = [
     "export",
     "fit",
     "import_balldrops",
+    "import_colmap",
     "import_contactnets",
     "import_csv",
     "import_elbow",
     "import_hdf5",
     "import_jugglebot",
+    "import_nerfstudio",
+    "import_photos",
     "import_pinwm",
+    "import_polycam",
     "import_pushes",
+    "import_record3d",
     "import_rosbag",
     "import_tum",
+    "import_video",
     "improve",
     "merge",
     "open_view",

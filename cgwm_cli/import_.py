@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _SPLITS = ("train", "test", "seed")
 _TRACKS = ("body", "up", *_SPLITS)
-_OPTIONS = {
+_OPTIONS: dict[str, tuple[str, ...]] = {
     "contactnets": _SPLITS,
     "pinwm": ("train",),
     "jugglebot": ("only", *_SPLITS),
@@ -28,6 +28,12 @@ _OPTIONS = {
     "tum": ("length_unit", "time_unit", *_TRACKS),
     "hdf5": ("columns", "length_unit", "time_unit", *_TRACKS),
     "rosbag": ("topic", *_TRACKS),
+    "photos": (),
+    "video": ("photos",),
+    "nerfstudio": ("length_unit",),
+    "colmap": ("length_unit",),
+    "polycam": (),
+    "record3d": ("photos",),
 }
 """Options that each format takes."""
 
@@ -36,13 +42,33 @@ _OPTIONS = {
 def import_capture(
     emit: Emit,
     format_: Annotated[
-        Literal["contactnets", "pinwm", "jugglebot", "balldrops", "pushes", "elbow", "csv", "tum", "hdf5", "rosbag"],
+        Literal[
+            "photos",
+            "video",
+            "nerfstudio",
+            "colmap",
+            "polycam",
+            "record3d",
+            "csv",
+            "tum",
+            "hdf5",
+            "rosbag",
+            "contactnets",
+            "pinwm",
+            "jugglebot",
+            "balldrops",
+            "pushes",
+            "elbow",
+        ],
         typer.Argument(
             metavar="FORMAT",
-            help="csv, tum, hdf5, rosbag: your own poses; contactnets: tosses of a cube (.pt files or .npz); pinwm: "
-            "pushes of a block, with frames and masks; jugglebot: throws of a ball; balldrops: falling balls; pushes: "
-            "a robot's finger that pushes an object, with forces (.txt of MLab_EXP, .json or .h5 of MIT push); elbow: "
-            "tosses of two links with a hinge (folder or .tar.xz of .pt files and a URDF).",
+            help="photos: a folder of photos (.heic, too); video: a walk around the scene, whose sharp frames become "
+            "photos; nerfstudio, colmap: photos with cameras (transforms.json, also Blender's; a COLMAP model); "
+            "polycam, record3d: scans of a phone; csv, tum, hdf5, rosbag: your own poses; contactnets: tosses of a "
+            "cube (.pt files or .npz); pinwm: pushes of a block, with frames and masks; jugglebot: throws of a ball; "
+            "balldrops: falling balls; pushes: a robot's finger that pushes an object, with forces (.txt of MLab_EXP, "
+            ".json or .h5 of MIT push); elbow: tosses of two links with a hinge (folder or .tar.xz of .pt files and a "
+            "URDF).",
             show_default=False,
         ),
     ],
@@ -93,7 +119,11 @@ def import_capture(
     ] = None,
     length_unit: Annotated[
         Literal["m", "cm", "mm", "in"] | None,
-        typer.Option("--length-unit", help="csv, tum, hdf5: unit of positions (m).", show_default=False),
+        typer.Option(
+            "--length-unit",
+            help="csv, tum, hdf5: unit of positions (m); nerfstudio, colmap: unit of the poses (none: unscaled).",
+            show_default=False,
+        ),
     ] = None,
     time_unit: Annotated[
         Literal["s", "ms", "us", "ns"] | None,
@@ -113,11 +143,16 @@ def import_capture(
         str | None,
         typer.Option("--topic", help="rosbag: topic of the poses; for transforms /tf:CHILD_FRAME.", show_default=False),
     ] = None,
+    photos: Annotated[
+        int | None,
+        typer.Option("--photos", min=3, help="video, record3d: most photos to take (60).", show_default=False),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Convert recordings in another format to a capture."""
     given = {"train": train, "test": test, "seed": seed, "only": only, "columns": columns, "body": body, "up": up}
     given |= {"length_unit": length_unit, "time_unit": time_unit, "topic": topic, "spin_frame": spin_frame}
+    given["photos"] = photos
     words = {name: value for name, value in given.items() if value is not None}
     refuse_foreign(words, _OPTIONS[format_], format_, "omit it.")
     emit(_imported(format_, source, out, words, overwrite), _summary)
@@ -152,6 +187,9 @@ def _named(text: str) -> dict[str, str]:
 def _summary(result: ImportResult) -> str:
     from .output import warnings
 
+    if result.photos and not result.episodes:
+        cameras = "with their cameras" if result.posed else f"(next: cgwm calibrate {result.capture})"
+        return "\n".join([f"Wrote {result.capture}: {result.photos} photos {cameras}.", *warnings(result.warnings)])
     splits = ", ".join(f"{name} {count}" for name, count in result.splits.items())
     wrote = f"Wrote {result.capture}: {result.episodes} episodes ({splits}) with {result.samples} poses."
     return "\n".join([wrote, *warnings(result.warnings)])

@@ -30,7 +30,8 @@ def _told(value: Any) -> Any:
         return [_told(one) for one in value]
     if not isinstance(value, Path):
         return value
-    return f"sha256 {_content(value)}" if value.exists() else str(value)
+    # a device has no end, and a pipe no second reading
+    return f"sha256 {_content(value)}" if value.is_file() or value.is_dir() else str(value)
 
 
 def _content(path: Path) -> str:

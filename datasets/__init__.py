@@ -20,11 +20,15 @@ if TYPE_CHECKING:
     from .importers.elbow import import_elbow
     from .importers.hdf5_tracks import import_hdf5
     from .importers.jugglebot import import_jugglebot
+    from .importers.phone_scans import import_polycam, import_record3d
+    from .importers.photo_folder import import_photos
     from .importers.pinwm import import_pinwm
+    from .importers.posed_photos import import_colmap, import_nerfstudio
     from .importers.pushes import import_pushes
     from .importers.recordings import Units
     from .importers.rosbag import import_rosbag
     from .importers.tum import import_tum
+    from .importers.walk_video import import_video
     from .io.atomic import new_directory, new_file, sha256
     from .io.kinds import kind_of
     from .io.progress import progress
@@ -61,6 +65,16 @@ _HOMES = {
     "importers.recordings": ("Units",),
     "importers.rosbag": ("import_rosbag",),
     "capture.tracks": ("Track", "read_tracks", "write_tracks"),
+    "importers.photo_folder": ("import_photos",),
+    "importers.walk_video": ("import_video",),
+    "importers.posed_photos": (
+        "import_colmap",
+        "import_nerfstudio",
+    ),
+    "importers.phone_scans": (
+        "import_polycam",
+        "import_record3d",
+    ),
     "importers.tum": ("import_tum",),
     "capture.video": ("read_video",),
 }
@@ -81,15 +95,21 @@ __all__ = [
     "camera_of",
     "check_capture",
     "import_balldrops",
+    "import_colmap",
     "import_contactnets",
     "import_csv",
     "import_elbow",
     "import_hdf5",
     "import_jugglebot",
+    "import_nerfstudio",
+    "import_photos",
     "import_pinwm",
+    "import_polycam",
     "import_pushes",
+    "import_record3d",
     "import_rosbag",
     "import_tum",
+    "import_video",
     "kind_of",
     "manifest_toml",
     "mass_properties",

@@ -15,5 +15,9 @@ class ImportResult(FileModel):
     """Number of poses in all tracks."""
     splits: dict[str, int]
     """Number of episodes by split."""
+    photos: int = 0
+    """Number of photos."""
+    posed: bool = False
+    """Whether their cameras are known."""
     warnings: tuple[str, ...] = ()
     """What the files have and the capture has not."""

@@ -193,6 +193,20 @@ def _open(path: Path) -> cv2.VideoCapture:
     return capture
 
 
+def frames_of(path: Path) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames of a video file one after the other, BGR (height, width, 3), upright as its rotation says.
+
+    Raises:
+        InputDataError: If it does not decode, or has no frame.
+    """
+    decoded = False
+    for frame in _grab(path):
+        decoded = True
+        yield frame
+    if not decoded:
+        raise _undecodable(path)
+
+
 def _grab(path: Path) -> Iterator[NDArray[np.uint8]]:
     capture = _open(path)
     try:

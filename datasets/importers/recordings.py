@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 LengthUnit = Literal["m", "cm", "mm", "in"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
-_LENGTHS_M: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+LENGTHS_M: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _TIMES_S: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOWEST_STEP_S, _LONGEST_PATH_M = 1.0, 100.0
 """Largest time step and largest extent of a path for which numbers without a unit count as seconds and metres."""
@@ -121,7 +121,7 @@ class Units:
         quat = None if quat_wxyz is None else _unit(where, quat_wxyz[seen])
         track = Track(
             time * _TIMES_S[self.time or "s"],
-            position * _LENGTHS_M[self.length or "m"],
+            position * LENGTHS_M[self.length or "m"],
             quat,
             omega_body_rad_s=omega,
             force_n=None if force_n is None else _force(where, force_n[seen]),

@@ -65,6 +65,54 @@ def rosbag(root: Path) -> None:
     test_track_importers.write_bag(root / "bag", {"/pose": "geometry_msgs/msg/PoseStamped"})
 
 
+def phone_photos(root: Path) -> None:
+    """Write photos as a phone does, one of them HEIC where pillow-heif is installed."""
+    from datasets.importers import test_photo_importers
+
+    test_photo_importers._photos(root / "photos", ["a.jpg", "b.png"])
+    try:
+        import pillow_heif  # pyright: ignore[reportMissingImports]
+        from PIL import Image
+    except ImportError:
+        return
+    pillow_heif.from_pillow(Image.new("RGB", (64, 48), (90, 120, 30))).save(root / "photos" / "c.heic")
+
+
+def walk(root: Path) -> None:
+    """Write a video of a walk."""
+    from datasets.importers import test_photo_importers
+
+    test_photo_importers.write_walk(root / "walk.mp4", 12)
+
+
+def nerfstudio(root: Path) -> None:
+    """Write a transforms.json with its photos."""
+    from datasets.importers import test_photo_importers
+
+    test_photo_importers.write_transforms(root / "scene", ["images/a.png", "images/b.png", "images/c.png"])
+
+
+def colmap(root: Path) -> None:
+    """Write a COLMAP model with its photos."""
+    from datasets.importers import test_photo_importers
+
+    test_photo_importers.write_colmap(root / "scene")
+
+
+def polycam(root: Path) -> None:
+    """Write a raw export of Polycam."""
+    from datasets.importers import test_photo_importers
+
+    test_photo_importers.write_polycam(root / "scan")
+
+
+def record3d(root: Path) -> None:
+    """Write a recording of Record3D."""
+    from datasets.importers import test_photo_importers
+
+    test_photo_importers.write_record3d(root / "scan")
+
+
 def contactnets_npz(root: Path) -> None:
     """Write tosses as one .npz."""
     from datasets.importers import test_contactnets

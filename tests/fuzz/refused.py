@@ -209,6 +209,9 @@ _THROWS = ("jugglebot", "jugglebot throws --only b")
 _DROPS = ("balldrops", "balldrops drops")
 _ELBOW = ("elbow", "elbow elbow")
 _URDF = "elbow/elbow.urdf"
+_SCENE = "scene/transforms.json"
+_SCAN = "scan/keyframes/cameras/100.json"
+_NO_TURN = '"poses": [[0, 0, 0, 0, 1, 1, 1], ['
 _NET = "contactnets tosses --train 2 --test 1"
 IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("csv: times in ms", "csv", "csv csv", lambda root: _csv(root, "t", 1000)),
@@ -255,6 +258,18 @@ IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("elbow: a mimic joint", *_ELBOW, text(_URDF, "</joint>", '<mimic joint="a"/></joint>')),
     ("elbow: a loop", *_ELBOW, text(_URDF, '<child link="lower"/>', '<child link="upper"/>')),
     ("elbow: no XML", *_ELBOW, written(_URDF, "<robot>")),
+    ("photos: a photo cut off", "phone photos", "photos photos", written("photos/a.jpg", b"\xff\xd8\xff")),
+    ("photos: a text as HEIC", "phone photos", "photos photos", written("photos/c.heic", b"heic")),
+    ("photos: a named pipe", "phone photos", "photos photos", kind_of("photos/b.png", "fifo")),
+    ("video: a device", "walk", "video walk.mp4", kind_of("walk.mp4", "/dev/zero")),
+    ("video: a playlist", "walk", "video walk.mp4", written("walk.mp4", b"#EXTM3U\n/etc/passwd\n")),
+    ("nerfstudio: no pose", "nerfstudio", "nerfstudio scene", text(_SCENE, '"transform_matrix"', '"matrix"')),
+    ("nerfstudio: deep nesting", "nerfstudio", "nerfstudio scene", written(_SCENE, DEEP)),
+    ("colmap: a camera that is not there", "colmap", "colmap scene", text("scene/sparse/0/cameras.txt", "1 S", "2 S")),
+    ("polycam: a focal length of 0", "polycam", "polycam scan", text(_SCAN, '"fx": 60.0', '"fx": 0')),
+    ("polycam: a pose of zeros", "polycam", "polycam scan", text(_SCAN, '"t_00": ', '"t_00": 9')),
+    ("record3d: a quaternion of zeros", "record3d", "record3d scan", text("scan/metadata", '"poses": [[', _NO_TURN)),
+    ("record3d: K of text", "record3d", "record3d scan", text("scan/metadata", '"K": [60.0', '"K": ["60"')),
     ("contactnets: a pickle as .pt", "contactnets pt", _NET, lambda root: _pickled(root / "tosses/0.pt")),
 )  # fmt: skip
 

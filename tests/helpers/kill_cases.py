@@ -21,6 +21,7 @@ from helpers.thrown_cube import write_capture
 from helpers.tiny_capture import FAST, model_of, thrown, write_tiny_capture
 from pipeline.sg_gs.test_sg_gs import make_capture
 
+from datasets.importers import test_photo_importers
 from pipeline.calibrate import test_calibrate
 
 
@@ -162,6 +163,12 @@ def _import(folder: Path) -> Command:
     return Command(words=words, out=("out",))
 
 
+def _import_video(folder: Path) -> Command:
+    test_photo_importers.write_walk(folder / "walk.mp4", 12)
+    words = ["import", "video", str(folder / "walk.mp4"), "--photos", "4", "--out", str(folder / "out")]
+    return Command(words=words, out=("out",), check=(["validate", str(folder / "out")],))
+
+
 def _control(folder: Path) -> Command:
     write_small_model(folder / "model", visible=False)
     (folder / "task.toml").write_text(task_toml(push_task()))
@@ -186,6 +193,7 @@ CASES: dict[str, Callable[[Path], Command]] = {
     "export mjcf --overwrite": _replacing(_mjcf, "--seed", "5"),
     "export urdf": _urdf,
     "import csv": _import,
+    "import video": _import_video,
     "improve": _improve,
     "control": _control,
     "control --overwrite": _replacing(_control, "--draws", "2"),

@@ -1,0 +1,149 @@
+"""Common parts of the importers of photos: files that become photos of a capture, and the capture that is written."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import CamerasFile, CaptureManifest, InputDataError
+from ...schemas.imports import ImportResult
+from ...schemas.regular_files import require_regular_file
+from ..capture.files import entries_of
+from ..capture.images import IMAGE_SUFFIXES, image_size, write_image
+from ..capture.manifest import write_manifest
+from ..io.progress import progress
+
+HEIF_SUFFIXES = (".heic", ".heif")
+"""Suffixes of photos that are converted, in lower case."""
+_QUALITY = 97
+"""JPEG quality of a converted photo: what it loses lies below the noise of the sensor."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo on its way into a capture."""
+
+    source: Path
+    """The file."""
+    name: str
+    """Its name in `images/`, with the suffix that it will have there."""
+
+
+def photos_in(folder: Path) -> list[Photo]:
+    """Return the photos of a folder, sorted by name; HEIC becomes JPEG.
+
+    Raises:
+        InputDataError: If there is none, or two would have one name.
+    """
+    files = [path for path in entries_of(folder) if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
+    if not files:
+        others = sorted({path.suffix for path in entries_of(folder) if path.suffix})
+        raise InputDataError(
+            f"{folder}: no photos" + (f", but files {', '.join(others[:6])}." if others else "."),
+            "photos .jpg, .jpeg, .png, .heic or .heif.",
+            "name the folder that holds them.",
+        )
+    photos = [Photo(path, f"{path.stem}.jpg" if _is_heif(path) else path.name) for path in files]
+    require_distinct(photos)
+    return photos
+
+
+def require_distinct(photos: Iterable[Photo]) -> None:
+    """Refuse two photos that would have one name in the capture."""
+    seen: dict[str, Path] = {}
+    for photo in photos:
+        key = photo.name.lower()
+        if key in seen:
+            raise InputDataError(
+                f"{photo.source} and {seen[key]} would both be images/{photo.name}.",
+                "photos of different names.",
+                "rename one of the two, or remove it.",
+            )
+        seen[key] = photo.source
+
+
+def inside(name: str) -> str:
+    """Return the name that a photo gets in `images/`, from a path that may lead anywhere."""
+    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..", ".")]
+    parts = parts[1:] if len(parts) > 1 and parts[0] == "images" else parts
+    return "/".join(parts)
+
+
+def copy_photos(directory: Path, photos: Iterable[Photo]) -> None:
+    """Copy photos into `images/` of a capture; their headers are checked, HEIC is converted.
+
+    Raises:
+        InputDataError: If a file is no photo or is cut off.
+    """
+    photos = list(photos)
+    for photo in progress(photos, "photos", unit="photo"):
+        path = directory / "images" / photo.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if _is_heif(photo.source):
+            _convert(photo.source, path)
+        else:
+            image_size(photo.source)
+            shutil.copyfile(require_regular_file(photo.source), path)
+
+
+def write_photo_capture(
+    directory: Path, out: Path | str, photos: int, cameras: CamerasFile | None = None, warnings: Iterable[str] = ()
+) -> ImportResult:
+    """Write the manifest, and the cameras where there are some, of a capture whose photos are in place."""
+    write_manifest(directory / "capture.toml", CaptureManifest(format="cgwm-capture/1"))
+    if cameras is not None:
+        (directory / "cameras.json").write_text(cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    return ImportResult(
+        capture=str(out), episodes=0, samples=0, splits={}, photos=photos, posed=cameras is not None,
+        warnings=tuple(warnings),
+    )  # fmt: skip
+
+
+def _is_heif(path: Path) -> bool:
+    return path.suffix.lower() in HEIF_SUFFIXES
+
+
+def _convert(source: Path, path: Path) -> None:
+    """Write a HEIC photo as JPEG, upright, with its EXIF data (the focal length)."""
+    heif = _heif_reader(source)
+    try:
+        image = heif.open_heif(require_regular_file(source), convert_hdr_to_8bit=True).to_pillow()
+    except (ValueError, EOFError, OSError, RuntimeError, SyntaxError) as error:
+        raise InputDataError(
+            f"{source}: no HEIC photo that can be read ({error}).", todo="take the original."
+        ) from None
+    exif = image.getexif()
+    exif.pop(0x0112, None)  # the orientation: pixels are upright already
+    write_image(path, pixels_of(image.convert("RGB")), _QUALITY)
+    if exif:
+        _insert_exif(path, exif.tobytes())
+
+
+def pixels_of(image: Any) -> NDArray[np.uint8]:
+    """Return a picture of Pillow as RGB (H, W, 3)."""
+    return np.ascontiguousarray(np.asarray(image, np.uint8))
+
+
+def _insert_exif(path: Path, exif: bytes) -> None:
+    """Put EXIF data behind the start of a JPEG file (a segment APP1; one holds at most 65533 bytes)."""
+    if len(exif) <= 65533 - 2:
+        data = path.read_bytes()
+        path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
+
+
+def _heif_reader(source: Path) -> Any:
+    try:
+        import pillow_heif  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise InputDataError(
+            f"{source}: HEIC photos need the package pillow-heif, which is not installed.",
+            "photos .jpg or .png without it.",
+            'pip install "cgwm[heif]" (in a checkout: pip install ".[heif]").',
+        ) from None
+    return pillow_heif

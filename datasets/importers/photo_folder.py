@@ -1,0 +1,32 @@
+"""Import of a folder of photos, as phones and cameras write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...schemas.imports import ImportResult
+from ..io.atomic import new_directory
+from ..io.outputs import reads
+from .photo_captures import copy_photos, photos_in, write_photo_capture
+
+
+@reads("source")
+def import_photos(source: Path | str, out: Path | str, overwrite: bool = False) -> ImportResult:
+    """Write the photos of a folder as a capture, whose cameras `cgwm calibrate` estimates.
+
+    JPEG and PNG files are copied as they are; HEIC is converted to JPEG, turned upright, with its EXIF data. The
+    colours of a wide-gamut photo are kept as numbers, not converted.
+
+    Args:
+        source: The folder.
+        out: The capture directory to write.
+        overwrite: Replace `out`.
+
+    Raises:
+        InputDataError: If the folder has no photo, or one is damaged.
+        UsageError: If `out` exists, before anything is read.
+    """
+    with new_directory(out, "capture", overwrite) as directory:
+        photos = photos_in(Path(source))
+        copy_photos(directory, photos)
+        return write_photo_capture(directory, out, len(photos))
