@@ -52,7 +52,9 @@ def _dataset(path: Path, host: str, port: int) -> Viewer:
 
 def _model(path: Path, host: str, port: int) -> Viewer:
     model = read_model(path)
-    motions: dict[str, Callable[[], Motion]] = {"as in the photos": partial(still, model)}
-    if can_move(model):
+    moves = can_move(model)
+    motions: dict[str, Callable[[], Motion]] = {}
+    if moves:
         motions |= {f"rollout {number}": partial(own_motion, model, number) for number in range(OWN_MOTIONS)}
-    return Viewer(f"model {path.resolve().name}", model, motions, host, port)
+    motions["as in the photos"] = partial(still, model)
+    return Viewer(f"model {path.resolve().name}", model, motions, host, port, playing=moves)

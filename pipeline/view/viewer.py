@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from ...datasets.models.model import Model
-from ...schemas import CgwmError, UsageError
+from ...schemas import CgwmError, NotConvergedError, UsageError
 from ..rendering.contact_glyphs import SLIDING_RGB, STICKING_RGB
 from .door import Door, guarded, require_closed
 from .motions import Motion
@@ -63,17 +63,25 @@ class Viewer:
     Args:
         title: Title of the page.
         model: Model with bodies, background, ground and light.
-        motions: Functions that make the motions, by name; the first is called at once, the others when first chosen.
+        motions: Functions that make the motions, by name; the first that can be made is shown, the others are
+            called when first chosen.
         host: Address to listen on.
         port: Port to listen on; 0 takes a free one.
+        playing: Play from the beginning.
 
     Raises:
         UsageError: If viser is not installed, or the address is not available.
-        CgwmError: If the first motion cannot be made.
+        CgwmError: If no motion can be made.
     """
 
     def __init__(
-        self, title: str, model: Model, motions: Mapping[str, Callable[[], Motion]], host: str, port: int
+        self,
+        title: str,
+        model: Model,
+        motions: Mapping[str, Callable[[], Motion]],
+        host: str,
+        port: int,
+        playing: bool = False,
     ) -> None:
         viser = require_viser()
         port = _free_port(host, port)
@@ -82,7 +90,8 @@ class Viewer:
         self._lock = threading.RLock()
         self._shapes = shapes_of(model)
         self._size_m = radius_m(model, self._shapes)
-        self._motion = self._load(next(iter(motions)))
+        self._first, self._motion = self._first_motion()
+        self._playing = playing and len(self._motion.times_s) > 1
         door = Door(host)
         with contextlib.redirect_stdout(io.StringIO()), guarded(door, host):  # its banner is not shown
             self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
@@ -117,6 +126,14 @@ class Viewer:
             time.sleep(max(step_s * stride, 1 / _MOST_UPDATES_HZ))
             if self._playing and len(times_s) > 1:
                 self._frame.value = (self._frame.value + stride) % len(times_s)  # shows it, too
+
+    def _first_motion(self) -> tuple[str, Motion]:
+        """Return the first motion that can be made, with its name: a simulation may diverge."""
+        *others, last = self._made
+        for name in others:
+            with contextlib.suppress(NotConvergedError):
+                return name, self._load(name)
+        return last, self._load(last)
 
     def _load(self, name: str) -> Motion:
         if name not in self._kept:
@@ -205,11 +222,10 @@ class Viewer:
     def _add_controls(self) -> None:
         gui = self.server.gui
         names = list(self._made)
-        self._choice = gui.add_dropdown("motion", names, initial_value=names[0])
+        self._choice = gui.add_dropdown("motion", names, initial_value=self._first)
         self._frame = gui.add_slider("frame", min=0, max=1, step=1, initial_value=0)
         self._status = gui.add_markdown("")
-        self._play = gui.add_button("Play", icon=None)
-        self._playing = False
+        self._play = gui.add_button("Pause" if self._playing else "Play", icon=None)
         self._speed = gui.add_dropdown("speed", list(SPEEDS), initial_value="3 times slower")
         places = gui.add_button_group("look from", [_OVERVIEW, *self._motion.cameras])
         places.on_click(lambda event: self._guarded(lambda: self._look_from(event.client, places.value)))

@@ -386,10 +386,17 @@ def test_the_slider_moves_the_splats(red_dataset: Path, tmp_path: Path, served: 
 
 
 @needs_viser
-def test_a_model_moves_by_itself(red_dataset: Path, tmp_path: Path, served: Callable[[Path], str]) -> None:
+def test_a_model_opens_in_motion(red_dataset: Path, tmp_path: Path, served: Callable[[Path], str]) -> None:
     url = served(red_dataset / "model")
     with chromium(tmp_path) as page:
         page.open(url)
+        page.until("document.body.innerText.includes('Pause') && / of 31/.test(document.body.innerText)")
+        click(page, "Pause")
+        page.run("[...document.querySelectorAll('input')].find(e => e.value === 'rollout 0').click()")
+        page.until("[...document.querySelectorAll('[role=option]')].some(e => e.innerText === 'as in the photos')")
+        page.run(
+            "[...document.querySelectorAll('[role=option]')].find(e => e.innerText === 'as in the photos').click()"
+        )
         page.until_it_says("frame 1 of 1")
         resting = eventually(page, lambda found: len(found) > 100).mean(0)
         page.run("[...document.querySelectorAll('input')].find(e => e.value === 'as in the photos').click()")
