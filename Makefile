@@ -9,7 +9,7 @@ FILES := $(sort $(shell find cgwm cgwm_cli datasets pipeline schemas -name '*.py
 
 CHECKS = $(BIN)/ruff check && $(BIN)/ruff format --check && $(BIN)/pyright
 
-.PHONY: help install demo test lint same graph docs results evidence clean force
+.PHONY: help install demo test lint same graph docs dist results evidence clean force
 
 help:
 	@echo 'make demo      run the whole pipeline on a scene that it makes itself; the report: $(OUT)/report.html'
@@ -19,6 +19,7 @@ help:
 	@echo 'make same      compare what this tree computes with the outputs of the last commit (tools/same.py)'
 	@echo 'make graph     print the import graph of the rooms, and draw it: docs/import-graph.svg'
 	@echo 'make docs      build the documentation as a site that is read offline: build/docs/index.html'
+	@echo 'make dist      the source archive, and the wheel that is built from it: dist/'
 	@echo 'make evidence  the measurements that take longer than tests may; resumable, results in out/evidence/'
 	@echo 'make results   write docs/results.md from the figures in benchmarks/results/'
 	@echo 'make clean     remove what make made: $(VENV)/, build/, out/'
@@ -55,6 +56,13 @@ docs: $(VENV)/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo 'Open build/docs/index.html'
 
+# The wheel is built from the archive, so that an archive which lacks a file fails here.
+dist: install
+	@rm -rf dist && mkdir dist
+	@$(BIN)/python -c "from setuptools import build_meta; build_meta.build_sdist('dist')" > dist/build.log
+	@$(PIP) wheel --quiet --no-deps --no-build-isolation --no-index --wheel-dir dist dist/*.tar.gz
+	@rm dist/build.log && ls -l dist
+
 evidence: install
 	$(BIN)/pytest -m evidence
 	cd tests && for what in '--cases 3000 --seed 1' '--table refuse' '--table accept'; do echo "== fuzz $$what"; OMP_NUM_THREADS=1 PYTHONSAFEPATH=1 PYTHONPATH=. ../$(BIN)/python -m fuzz $$what --failures ../out/evidence/fuzz || echo "fuzz: a bar was missed"; done
@@ -64,7 +72,7 @@ results:
 	$(PYTHON) benchmarks/render_results.py
 
 clean:
-	rm -rf $(VENV) build out *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) build out dist *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/made:

@@ -55,7 +55,6 @@ GROUPS = {
 
 _MANNERS: dict[str, Any] = {
     "no_args_is_help": True,
-    "add_completion": False,
     "rich_markup_mode": None,
     "pretty_exceptions_enable": False,
     "context_settings": {"help_option_names": ["-h", "--help"]},
@@ -64,12 +63,13 @@ app = typer.Typer(
     name="cgwm",
     help="From photos and one short contact-rich motion to a fitted physical world model and labelled 4D datasets.",
     epilog="Exit codes: 0 done, 1 the work failed, 2 wrong usage or bad input, 130 interrupted.",
+    add_completion=True,
     **_MANNERS,
 )
 for _name, _function, _short_help in VERBS:
     app.command(_name, short_help=_short_help)(_function)
 for _name, (_short_help, _verbs) in GROUPS.items():
-    _group = typer.Typer(name=_name, help=_short_help, **_MANNERS)
+    _group = typer.Typer(name=_name, help=_short_help, add_completion=False, **_MANNERS)
     for _verb, _function, _help in _verbs:
         _group.command(_verb, short_help=_help)(_function)
     app.add_typer(_group)

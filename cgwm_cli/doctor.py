@@ -40,6 +40,11 @@ def _summary(report: DoctorReport) -> str:
         ["HDF5 zstd", "works" if report.hdf5_zstd else "does not work"],
     ]
     packages = [[package.name, package.version or "missing", package.requirement] for package in report.packages]
+    extras = [
+        [one.name, f"missing: {', '.join(one.missing)}" if one.missing else "ready", one.purpose]
+        for one in report.extras
+    ]
     uses = [[name.replace("_", " "), text] for name, text in report.uses.items()]
-    blocks = [("This machine", machine), ("Packages", packages), ("What cgwm would use", uses)]
+    blocks = [("This machine", machine), ("Packages", packages)]
+    blocks += [("Extras, pip install 'cgwm[NAME]'", extras), ("What cgwm would use", uses)]
     return "\n".join([*lines, *(f"{title}\n{table(rows)}" for title, rows in blocks)])

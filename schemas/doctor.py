@@ -25,6 +25,15 @@ class Missing(FileModel):
     """What to type."""
 
 
+class ExtraState(FileModel):
+    """An extra of cgwm: packages for one purpose, never required."""
+
+    name: str
+    purpose: str
+    missing: tuple[str, ...] = ()
+    """Requirements that are not fulfilled; none where the extra is ready."""
+
+
 class DoctorReport(FileModel):
     """What a machine has, and what cgwm would use of it."""
 
@@ -53,6 +62,7 @@ class DoctorReport(FileModel):
     uses: dict[str, str]
     """What cgwm would use, by purpose."""
     missing: tuple[Missing, ...] = ()
+    extras: tuple[ExtraState, ...] = ()
 
     @property
     def ready(self) -> bool:

@@ -13,10 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from ...datasets.io.processors import processor_limits, processors
-from ...schemas.doctor import DoctorReport, Missing, PackageState
+from ...schemas.doctor import DoctorReport, ExtraState, Missing, PackageState
 from .kernel_build import compiler, unavailable
 
 _IMPORT_NAMES = {"opencv-python-headless": "cv2"}
+EXTRAS = {
+    "view": "cgwm view",
+    "heif": "cgwm import photos of .heic files",
+    "ros": "cgwm import rosbag",
+    "usd": "cgwm export --to usd",
+    "lerobot": "cgwm export --to lerobot",
+    "ray": "cgwm synthesize --ray",
+}
+"""Extras that a user may want, and what each is for; the others are for work on cgwm itself."""
 _CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
 _GIB = 2**30
 
@@ -49,6 +58,7 @@ def doctor() -> DoctorReport:
         hdf5_zstd=not zstd_fault,
         uses=_uses(cuda, not zstd_fault),
         missing=tuple(missing),
+        extras=tuple(_extra(name, purpose) for name, purpose in EXTRAS.items()),
     )
 
 
@@ -109,6 +119,18 @@ def _packages() -> list[PackageState]:
         satisfied = version is not None and satisfies(version, requirement)
         states.append(PackageState(name=name, requirement=requirement, version=version, satisfied=satisfied))
     return states
+
+
+def _extra(name: str, purpose: str) -> ExtraState:
+    """Return which requirements of an extra are not fulfilled."""
+    try:
+        lines = [line.partition(";") for line in metadata.requires("cgwm") or []]
+    except metadata.PackageNotFoundError:
+        lines = []
+    wanted = [line.strip() for line, _, marker in lines if re.search(rf"extra == ['\"]{name}['\"]", marker)]
+    versions = {one: _version(re.split(r"[<>=!~\[ ]", one, maxsplit=1)[0]) for one in wanted}
+    missing = tuple(one for one, version in versions.items() if version is None or not satisfies(version, one))
+    return ExtraState(name=name, purpose=purpose, missing=missing)
 
 
 def _missing_package(package: PackageState) -> Missing:

@@ -1,5 +1,6 @@
 """What `cgwm doctor` finds, and what it says when something is missing."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -118,3 +119,23 @@ with running(quiet="quiet" in sys.argv):
         for words in ([], ["quiet"])
     ]
     assert said == ["Warning: it is slow because of this\n", ""]
+
+
+def test_each_extra_says_what_it_lacks_and_what_it_is_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_version(monkeypatch, "rosbags", None)
+    set_version(monkeypatch, "viser", "0.2.0")
+    set_version(monkeypatch, "usd-core", "26.11")
+    extras = {one.name: one for one in doctor().extras}
+    provided = set(metadata.metadata("cgwm").get_all("Provides-Extra") or [])
+    assert set(extras) == provided - {"dev", "docs", "benchmarks"}
+    (line,) = extras["ros"].missing
+    assert line.startswith("rosbags") and extras["ros"].purpose == "cgwm import rosbag"
+    assert [one.startswith("viser") for one in extras["view"].missing] == [True]
+    assert extras["usd"].missing == ()
+
+
+def test_a_shell_completes_verbs() -> None:
+    environment = os.environ | {"_CGWM_COMPLETE": "complete_bash", "COMP_WORDS": "cgwm cal", "COMP_CWORD": "1"}
+    script = "import sys; sys.argv[0] = 'cgwm'; from cgwm.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == ["calibrate"], done.stderr
