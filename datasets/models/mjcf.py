@@ -2,6 +2,16 @@
 
 The conversion is approximate, because MuJoCo's soft contacts follow another law. `solref = (tau / zeta, zeta)` gives
 the same restitution and contact time; the penetration at rest differs.
+
+Friction has a time constant of its own there. MuJoCo lets slip decay with that of solref, which for a bouncy contact is
+many contact times, while Coulomb's law makes a body stick as soon as the impulse suffices. A shorter one is no remedy
+without limit: MuJoCo's cone of friction adds mu times the demanded slip acceleration to the normal one (its dual
+problem, "Computation", section "Constraint model"), so that friction lifts the body. With `solreffriction = (tau, 1)`
+slip decays within one contact time, as long as an impact lasts. Over eight sets of friction, contact time and damping
+the deviation from Coulomb's law was within a fifth of the least that any time constant between 0.35 tau and 3 tau
+reached, except at friction 0.8 (a quarter to a half); other values of solimp, impratio, friction and MuJoCo's pyramidal
+cone were no better (`benchmarks/mjcf_contacts.py`). Only a `pair` can have it, so each two geoms that may touch are
+one.
 """
 
 from __future__ import annotations
@@ -34,6 +44,8 @@ FAR = 1e4
 """Stop that no joint reaches, where a joint has only the other one [rad or m]."""
 MOST_PAIRS = 50_000
 """Maximum number of pairs of geoms of two bodies with a contact law of their own."""
+MOST_COMMON_PAIRS = 5_000
+"""The same where they have the law of all others: with more, they keep the friction of MuJoCo's own contacts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +86,11 @@ def write_mjcf(
     # RK4: the other integrators damp the tumbling of a free body.
     option = {"timestep": _text(_timestep(file)), "gravity": _text(file.gravity_m_s2), "integrator": "RK4"}
     ET.SubElement(root, "option", option, cone="elliptic")
-    defaults = ET.SubElement(ET.SubElement(root, "default"), "geom", contype="1", conaffinity="1", condim="3")
-    defaults.attrib.update(_contact(file.contact))
+    defaults = ET.SubElement(root, "default")
+    geom = ET.SubElement(defaults, "geom", contype="1", conaffinity="1", condim="3")
+    geom.attrib.update(_contact(file.contact))
+    if file.contact is not None:
+        ET.SubElement(defaults, "pair", _pair(file.contact))
     world = ET.SubElement(root, "worldbody")
     if file.ground is not None:
         normal = np.asarray(file.ground.normal)
@@ -174,6 +189,12 @@ def _contact(contact: ContactParameters | None) -> dict[str, str]:
     }
 
 
+def _pair(law: ContactParameters) -> dict[str, str]:
+    """Return the attributes of a `pair` with a contact law."""
+    friction = {"friction": _text((law.friction, law.friction, 0.0, 0.0, 0.0)), "condim": "3"}
+    return _contact(law) | friction | {"solreffriction": _text((law.contact_time_s, 1.0))}
+
+
 def _add_surface(root: ET.Element, world: ET.Element, surface: Surface, model: Model) -> None:
     """Add a fixed surface as a geom; each triangle of a mesh is one, as MuJoCo makes meshes convex."""
     place = {"pos": _text(surface.pose.position_m), "quat": _text(surface.pose.quat_wxyz)}
@@ -221,39 +242,55 @@ def _add_contacts(root: ET.Element, model: Model) -> None:
 
 
 def _add_pairs(contact: ET.Element, model: Model) -> None:
-    """Add a `pair` for each two geoms whose materials have a law of their own.
+    """Add a `pair` for each two geoms that may touch.
 
     A pair takes the place of what MuJoCo makes of the parameters of its two geoms; those of geoms are of all others.
     """
     file = model.file
     laws = {pair_of(*entry.materials): entry for entry in file.pairs}
+    for body, other, material, names in _touching(model):
+        own = None if body.material is None or material is None else laws.get(pair_of(body.material, material))
+        mine = _geoms(body, model)
+        count = len(mine) * len(names)
+        if own is None and (file.contact is None or count > MOST_COMMON_PAIRS):
+            continue
+        if count > MOST_PAIRS:
+            raise InputDataError(
+                f"body '{body.name}' and '{other}' have {len(mine)} and {len(names)} geoms and a contact law of "
+                f"their own, which MJCF needs {count} pairs for.",
+                f"up to {MOST_PAIRS} pairs.",
+                "fit with fewer collision spheres (--spheres), or give the surface fewer triangles.",
+            )
+        numbers = {} if own is None else _pair(own)
+        for first, second in product(mine, names):
+            ET.SubElement(contact, "pair", geom1=first, geom2=second).attrib.update(numbers)
+
+
+def softer_pairs(model: Model) -> list[tuple[str, str]]:
+    """Return the bodies and surfaces that have too many pairs of geoms for a time constant of friction of their own."""
+    laws = {pair_of(*entry.materials) for entry in model.file.pairs}
+    return [
+        (body.name, other)
+        for body, other, material, names in _touching(model)
+        if len(_geoms(body, model)) * len(names) > MOST_COMMON_PAIRS
+        and (body.material is None or material is None or pair_of(body.material, material) not in laws)
+    ]
+
+
+def _touching(model: Model) -> Iterator[tuple[BodyModel, str, str | None, list[str]]]:
+    """Yield what may touch, of which one moves: a body, and name, material and geoms of a body or surface."""
+    file = model.file
     fixed = [(one.name, one.material, _surface_geoms(one, model)) for one in file.surfaces]
     if file.ground is not None:
         fixed.append(("ground", file.ground.material, ["ground"]))
     articulation = {link: one.name for one in file.articulations for link in one.links}
     for index, body in enumerate(file.bodies):
-        others = list(fixed) if body.motion in MOVED else []
-        others += [
-            (other.name, other.material, _geoms(other, model))
-            for other in file.bodies[index + 1 :]
-            if (body.motion in MOVED or other.motion in MOVED)
-            and (body.name not in articulation or articulation[body.name] != articulation.get(other.name))
-        ]
-        for other, material, names in others:
-            law = None if body.material is None or material is None else laws.get(pair_of(body.material, material))
-            if law is None:
-                continue
-            mine = _geoms(body, model)
-            if len(mine) * len(names) > MOST_PAIRS:
-                raise InputDataError(
-                    f"body '{body.name}' and '{other}' have {len(mine)} and {len(names)} geoms and a contact law of "
-                    f"their own, which MJCF needs {len(mine) * len(names)} pairs for.",
-                    f"up to {MOST_PAIRS} pairs.",
-                    "fit with fewer collision spheres (--spheres), or give the surface fewer triangles.",
-                )
-            numbers = _contact(law) | {"friction": _text((law.friction, law.friction, 0.0, 0.0, 0.0)), "condim": "3"}
-            for first, second in product(mine, names):
-                ET.SubElement(contact, "pair", geom1=first, geom2=second).attrib.update(numbers)
+        for other in fixed if body.motion in MOVED else []:
+            yield body, *other
+        for other in file.bodies[index + 1 :]:
+            jointed = body.name in articulation and articulation[body.name] == articulation.get(other.name)
+            if (body.motion in MOVED or other.motion in MOVED) and not jointed:
+                yield body, other.name, other.material, _geoms(other, model)
 
 
 def _surface_geoms(surface: Surface, model: Model) -> list[str]:
@@ -265,7 +302,11 @@ def _surface_geoms(surface: Surface, model: Model) -> list[str]:
 def _geoms(body: BodyModel, model: Model) -> list[str]:
     """Return the names of a body's geoms."""
     spheres = model.collision.get(body.name)
-    return [f"{body.name}_{k}" for k in range(1 if spheres is None else len(spheres))]
+    if spheres is None:
+        shape = body.shape
+        known = shape is not None and (shape.box is not None or shape.sphere is not None)
+        return [f"{body.name}:0"] if known else []
+    return [f"{body.name}:{k}" for k in range(len(spheres))]  # no name of another body or surface has a colon
 
 
 def _add_articulation(world: ET.Element, one: ArticulationModel, model: Model) -> None:
@@ -311,12 +352,12 @@ def _add_body(
     spheres = model.collision.get(body.name)
     if spheres is not None:
         radii = np.asarray(spheres.scales, float) * body.radius_factor
-        names = _geoms(body, model) if model.file.pairs else []
-        for k, (center, radius) in enumerate(zip(np.asarray(spheres.means, float), radii, strict=True)):
-            geom = ET.SubElement(element, "geom", {"name": names[k]} if names else {})
+        parts = zip(_geoms(body, model), np.asarray(spheres.means, float), radii, strict=True)
+        for name, center, radius in parts:
+            geom = ET.SubElement(element, "geom", name=name)
             geom.attrib.update(type="sphere", pos=_text(center), size=_text(radius))
     elif body.shape is not None and (body.shape.box is not None or body.shape.sphere is not None):
-        geom = ET.SubElement(element, "geom", {"name": _geoms(body, model)[0]} if model.file.pairs else {})
+        geom = ET.SubElement(element, "geom", name=_geoms(body, model)[0])
         if body.shape.box is not None:
             geom.attrib.update(type="box", size=_text(body.shape.box.half_extents_m))
         elif body.shape.sphere is not None:

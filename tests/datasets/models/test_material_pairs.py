@@ -70,7 +70,13 @@ def test_a_pair_is_a_pair_of_geoms_in_mjcf() -> None:
     assert len(pairs) == len(geoms) - 1 > 0  # each sphere with the ground
     assert all(pair.get("geom1") in geoms and pair.get("geom2") == "ground" for pair in pairs)
     assert {pair.get("friction") for pair in pairs} == {"0.2 0.2 0 0 0"}
-    assert ET.fromstring(write_mjcf(model(pairs=(), parameters=()))).find("contact") is None
+    common = ET.fromstring(write_mjcf(model(pairs=(), parameters=())))
+    assert {len(pair.attrib) for pair in common.findall("contact/pair")} == {2}  # the law of all is the default
+    law = model().file.contact
+    assert law is not None
+    default = common.find("default/pair")
+    assert default is not None and default.get("friction") == f"{law.friction:g} {law.friction:g} 0 0 0"
+    assert default.get("solreffriction") == f"{law.contact_time_s:g} 1"
 
 
 def test_pairs_of_bodies_and_surfaces() -> None:
@@ -87,7 +93,8 @@ def test_pairs_of_bodies_and_surfaces() -> None:
     for pair in pairs:
         frictions.setdefault(str(pair.get("geom2")), set()).add(str(pair.get("friction")))
     ice = {"0.03 0.03 0 0 0"}
-    assert frictions == {"ground": {"0.2 0.2 0 0 0"}, "sheet": ice, **{f"track_{k}": ice for k in range(8)}}
+    own = {"ground": {"0.2 0.2 0 0 0"}, "sheet": ice, **{f"track_{k}": ice for k in range(8)}}
+    assert frictions == {**own, "post": {"None"}}  # a post without a material has the default law
     steel = Body(name="cube", mass_kg=1.0, material="steel")
     materials = (Material(name="steel"), Material(name="ice", friction=0.1))
     manifest = CaptureManifest(
