@@ -52,8 +52,8 @@ NO_START = "the model has jointed bodies: the MJCF has no start, and no motion o
 URDF_NOTE = "a URDF has no contact law and no pose of what moves freely; each body and each jointed body has a file"
 USD_NOTE = "USD has friction and restitution of materials, but no contact time: simulators choose their own stiffness"
 SOFT_FRICTION = (
-    "friction in MuJoCo is softer than Coulomb's law: slip decays within one contact time; thrown cubes were 4 to 10 mm "
-    "(median) off 0.1 s after the first contact, slippery ones most"
+    "friction in MuJoCo is softer than Coulomb's law: slip decays within one contact time; thrown cubes were 4 to 10 "
+    "mm (median) off 0.1 s after the first contact, slippery ones most"
 )
 SOFTER_PAIRS = (
     "{first} and {second} have too many pairs of collision spheres: between them slip decays with the time constant of "
