@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..geometry.rotation import cross
 from ..optimization.forward_mode import parts_of
-from .edge_contact import Crossings, Edges, best_normal, slots_of
+from .edge_contact import FACE_SLACK_M, Crossings, Edges, best_normal, slots_of
 from .fixed_surface import HALF_SPACE
 from .hull import MOST_PLANES, Hull, hull_distance, parallel_face, parting
 from .smooth_distance import blended, log_sum_exp_distance, smooth_min
@@ -246,8 +246,18 @@ def _parted(a: Placed, b: Placed) -> _Parting | None:
         none = torch.zeros((len(axis), 0), dtype=torch.int64, device=axis.device)
         return _Parting(flat, none, axis.new_zeros(none.shape))
     found = Crossings.of(_edges_of(a).across(2), _edges_of(b).across(1))
-    _, best = best_normal(found, torch.maximum(height_a, height_b), axis)
+    height = torch.maximum(height_a, height_b)
+    most, best = best_normal(found, height, axis)
+    # where edges part the bodies, faces that part them worse are not what touches; spheres beside edges may protrude
+    other = (most > height) & (_gap_along(a, b, best) > height + FACE_SLACK_M)
+    flat = (torch.where(other, -1, flat[0]), torch.where(other, -1, flat[1]))
     return _Parting(flat, *slots_of(found, best))
+
+
+def _gap_along(a: Placed, b: Placed, normal: Tensor) -> Tensor:
+    """Return the gap (n,) [m] between the spheres of two bodies along normals (n, 3) out of the first."""
+    ends = [(x.centers() @ (sign * normal)[..., None]).squeeze(-1) + x.radii() for x, sign in ((a, 1.0), (b, -1.0))]
+    return -ends[0].amax(1) - ends[1].amax(1)
 
 
 def _edges_of(body: Placed) -> Edges:

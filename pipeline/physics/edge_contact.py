@@ -26,6 +26,9 @@ LEAST_CROSSING = 1e-4
 OUT_OF_FACE = 0.01
 """By how much the normal of a contact may lean towards one of the faces of an edge [1]: for faces on each other."""
 
+FACE_SLACK_M = 2e-4
+"""By how much worse than edges the faces may part two bodies that still lie flat on each other [m]: a tilt."""
+
 
 @dataclass(frozen=True)
 class Edges:

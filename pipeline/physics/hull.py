@@ -35,6 +35,10 @@ Spheres at the rim of two equal faces would else be pushed off the rounded edges
 """
 LEAST_SHARP = 0.996
 """Largest cosine between the normals of two faces with an edge between them: 5 degrees."""
+LEVEL = 0.01
+"""Largest difference of the radii at both ends of such an edge, in units of its length: elsewhere it is no edge but a
+cone, of a large sphere that lies inside of a corner.
+"""
 PARALLEL = 0.98
 """Least cosine between the normals of faces that lie on each other."""
 MOST_PLANES = 4096
@@ -234,7 +238,9 @@ def _ridges_between(centers: Array, radii: Array, triangles: Corners, planes: Ar
     kept = [
         (pair, faces)
         for pair, faces in sides.items()
-        if len(faces) == 2 and planes[faces[0], :3] @ planes[faces[1], :3] < LEAST_SHARP
+        if len(faces) == 2
+        and planes[faces[0], :3] @ planes[faces[1], :3] < LEAST_SHARP
+        and abs(radii[pair[1]] - radii[pair[0]]) <= LEVEL * np.linalg.norm(centers[pair[1]] - centers[pair[0]])
     ]
     found = np.array([pair for pair, _ in kept], dtype=np.int64).reshape(-1, 2)
     inward = np.array([[_away(centers, radii, pair, triangles[f], planes[f]) for f in faces] for pair, faces in kept])

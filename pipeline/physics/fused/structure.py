@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ...runtime import kernel_build
 from ..contact_detection import FAR_M, PAIR_SMOOTHING_M
-from ..edge_contact import LEAST_CROSSING, OUT_OF_FACE
+from ..edge_contact import FACE_SLACK_M, LEAST_CROSSING, OUT_OF_FACE
 from ..fixed_surface import BOX, HALF_SPACE, MESH
 from ..friction_ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
 from ..hull import MOST_PLANES, OVERHANG_M, PARALLEL, SAME_NORMAL, SAME_PLANE_M
@@ -38,6 +38,7 @@ _NUMBERS: dict[str, float] = {
     "OVERHANG_M": OVERHANG_M,
     "LEAST_CROSSING": LEAST_CROSSING,
     "OUT_OF_FACE": OUT_OF_FACE,
+    "FACE_SLACK_M": FACE_SLACK_M,
     "PARALLEL": PARALLEL,
     "MOST_PLANES": MOST_PLANES,
     "ONSET_M": CONTACT_ONSET_M,

@@ -137,6 +137,16 @@ def test_two_boxes_part_best_along_the_normal_of_a_face_or_of_two_edges() -> Non
         assert bool((gap(direction.expand(60, 3)) <= most + 1e-12)[deep].all())
 
 
+def test_a_large_sphere_that_protrudes_from_a_face_has_no_edges() -> None:
+    """Its cones to the corners are none: a normal of two of them would part bodies that overlap."""
+    box = box_body((0.05, 0.03, 0.02), radius=0.0005)
+    centers = torch.cat((box.centers[0], torch.tensor([[0.038, 0.018, 0.008]], dtype=F64)))
+    radii = torch.cat((box.radii[0], torch.tensor([0.0128], dtype=F64)))
+    hull = Hull.of(centers, radii, plane_contacts(centers, radii))
+    assert hull is not None and len(hull.supports) == 9
+    assert int(hull.edges.max()) == 8 and len(hull.ridges) and int(hull.ridges.max()) < 8
+
+
 def test_spheres_in_one_plane_have_no_hull() -> None:
     centers = batch([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [1.0, 1.0, 0]])[0]
     assert Hull.of(centers, torch.full((4,), 0.1, dtype=F64), torch.arange(4)) is None

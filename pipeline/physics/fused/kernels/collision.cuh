@@ -203,7 +203,8 @@ INLINE int flat_face(const Problem& problem, const Environment& env, int b, cons
 
 struct Parting {  // how two hulls part best
     int on_a, on_b;  // faces that lie flat on each other, -1 for none: parallel to the face that parts them best
-    Number gap, axis[3];  // largest gap along a normal of a face or of two edges, and that normal, out of a
+    Number axis[3];       // normal of a face or of two edges along which the gap is largest, out of a
+    Number gap;           // no point of one hull is nearer to the other one
 };
 
 // The edge of body b in the frame of body a.
@@ -214,6 +215,26 @@ INLINE Edge edge_in(const Problem& problem, const Environment& env, int a, int b
                    transposed(rotations[a], edge.inward), transposed(rotations[a], edge.other_inward), edge.radius,
                    edge.widening};
     return turned;
+}
+
+// Gap between the hulls of two bodies along a unit vector of the world, out of a.
+INLINE Number gap_along(const Problem& problem, const Environment& env, int a, int b, const Mat* rotations,
+                        const Number* axis) {
+    Vec n = vec(Real(axis[0]), Real(axis[1]), Real(axis[2]));
+    Number ends[2];
+    for (int side = 0; side < 2; side++) {
+        int body = side ? b : a;
+        Hull hull = hull_of(problem, env, body);
+        Vec within = transposed(rotations[body], side ? -n : n);
+        Number x = plain(within.x), y = plain(within.y), z = plain(within.z), most = Number(-1e30);
+        for (int k = 0; k < hull.supports; k++) {
+            const Number* s = hull.support(k);
+            most = greater(most, x * s[0] + y * s[1] + z * s[2] + s[3]);
+        }
+        Vec origin = env.bodies[body].position - rotations[body] * env.constants[body].com;
+        ends[side] = most + (side ? -plain(dot(n, origin)) : plain(dot(n, origin)));
+    }
+    return -ends[1] - ends[0];
 }
 
 // Finds how the hulls of two bodies part best; false where they are not compared.
@@ -231,19 +252,25 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
     found.on_b = flat_face(problem, env, b, rotations[b], Number(-1), found.axis);
     if (contact_count(p) == sphere_count(a) + sphere_count(b)) return true;
     Hull hull = hull_of(problem, env, a);
+    Number most = found.gap;
     for (int j = 0; j < ridge_count(b); j++) {
         Edge second = edge_in(problem, env, a, b, rotations, j);
         for (int i = 0; i < hull.ridges; i++) {
             Crossing crossing;
             if (!cross_edges(edge_of(hull, i), second, crossing)) continue;
-            if (crossing.lean > Number(0) || !(plain(crossing.gap) > found.gap)) continue;
-            found.gap = plain(crossing.gap);
+            if (crossing.lean > Number(0) || !(plain(crossing.gap) > most)) continue;
+            most = plain(crossing.gap);
             Vec normal = rotations[a] * crossing.normal;
             found.axis[0] = plain(normal.x);
             found.axis[1] = plain(normal.y);
             found.axis[2] = plain(normal.z);
         }
     }
+    if (!(most > found.gap)) return true;
+    Number exact = gap_along(problem, env, a, b, rotations, found.axis);  // spheres beside the edges may protrude
+    // where edges part the bodies, faces that part them worse are not what touches
+    if (exact > found.gap + Number(FACE_SLACK_M)) found.on_a = found.on_b = -1;
+    found.gap = greater(found.gap, exact);
     return true;
 }
 
