@@ -1,16 +1,22 @@
 """Planar push to a pose: cgwm's controller beside rivals, on MuJoCo with the true mesh.
 
 python benchmarks/control.py run [--objects t_block,mug] [--seeds 20] [--contenders mppi,cem] [--clock real|ideal|cpu]
+python benchmarks/control.py run --fits FOLDER --contenders "true,fitted,fitted + draws" [--plants all]
 python benchmarks/control.py table
 
 A run begins anywhere within 0.25 m of the goal, at any angle, and succeeds within 10 mm and 5 deg for 0.5 s, within
 60 s. The mug's convex parts come from the archive of scans. Clocks: real charges each plan its wall time, cpu the time
 of all processors (what one idle core would need), ideal nothing. Every run is a stored result.
 
-Contenders: `mppi`, `gauss-newton`, `both`: cgwm with a model of the true shape and numbers; `fitted`: mppi with the
-models of `--models FOLDER`, FOLDER/<object>; `cem`: CEM over MuJoCo with the true mesh, with as many samples as the
-time of cgwm's plan allows; `cem + pushes`: cgwm's sampling, with its proposals of pushes, over it; `open loop`: the
-commands that cgwm finds in its model, played; `greedy`: pushes from behind, straight to the goal, then turns.
+Contenders: `mppi`, `gauss-newton`, `both`: cgwm with a model of the true shape and numbers; `cem`: CEM over MuJoCo with
+the true mesh, with as many samples as the time of cgwm's plan allows; `cem + pushes`: cgwm's sampling, with its
+proposals of pushes, over it; `open loop`: the commands that cgwm finds in its model, played; `greedy`: pushes from
+behind, straight to the goal, then turns.
+
+With `--fits`, FOLDER/<object> is what `cgwm demo --scene control` has written (box: seed 0, l_block: 2,
+hexagonal_prism: 3, t_block: 4), whose task is taken. `fitted` has the model of the photos and the video, `fitted +
+draws` judges plans under four draws of what that fit is unsure of, `true` has the true shape and numbers. The plants
+have the errors of `PLANTS`, which no controller knows.
 """
 
 from __future__ import annotations
@@ -23,6 +29,7 @@ import tarfile
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +62,7 @@ from cgwm.schemas import (
     ModelFile,
     Pose,
     Provenance,
+    read_task,
 )
 from store import Store, shared_data
 
@@ -63,6 +71,18 @@ FRICTION, FINGER_FRICTION = 0.35, 0.3
 SPHERES = 64
 PLANNER_STEP_S = 0.005
 """Step of MuJoCo in the plans of CEM; twice that lets the finger sink in."""
+DRAWS, TRUE = 4, "true"
+PLANTS: dict[str, dict[str, float]] = {
+    "nominal": {},
+    "friction x 0.5": {"friction_factor": 0.5},
+    "friction x 2": {"friction_factor": 2.0},
+    "mass x 1.5": {"mass_factor": 1.5},
+    "size - 5 %": {"size_factor": 0.95},
+    "size + 5 %": {"size_factor": 1.05},
+    "30 ms late": {"delay_s": 0.03},
+    "3 mm, 3 deg of noise": {"noise_m": 0.003, "noise_deg": 3.0},
+}
+"""Errors of the plant and its sensing, which the controllers do not know."""
 ELITES, SPREAD = 3, (0.1, 0.6)
 """Of CEM: samples that the next mean and spread come from; smallest and largest spread in units of the limit."""
 
@@ -76,8 +96,14 @@ class Scene:
     task: ControlTask
 
 
-def scene(name: str, folder: Path) -> Scene:
-    """Return an object; its convex parts are written into the folder."""
+def scene(name: str, folder: Path, fits: Path | None = None) -> Scene:
+    """Return an object; its convex parts are written into the folder.
+
+    Args:
+        name: Name of the object.
+        folder: Where its parts are written.
+        fits: Folder of fits; None for none.
+    """
     if name == "mug":
         parts, mass, down = _mug(folder)
         meshes = tuple(path.name for path in parts)
@@ -95,8 +121,12 @@ def scene(name: str, folder: Path) -> Scene:
         found = distil(mesh_volume(Mesh(solid.vertices, solid.faces)), SPHERES)
         centers, radii, mass, down = found.centers, found.radii, solid.mass, resting_down(solid)
     body, collision = _body(every, mass, down, Splats(centers, radii / 2, np.full(len(radii), 0.9), _grey(len(radii))))
-    contact = ContactParameters(friction=FRICTION, contact_time_s=0.004, damping_ratio=0.5)
+    task = None if fits is None else read_task(fits / name / "push.toml")
+    friction = FRICTION if task is None or task.plant.friction is None else task.plant.friction
+    contact = ContactParameters(friction=friction, contact_time_s=0.004, damping_ratio=0.5)
     file = ModelFile(ground=Ground(), bodies=(body,), contact=contact, provenance=Provenance(capture="none"))
+    if task is not None:
+        return Scene(name, Model(root=None, file=file, collision={"object": collision}), task)
     plant = {"kind": "mujoco", "meshes": meshes, "friction": FRICTION, "finger_friction": FINGER_FRICTION,
              "mass_kg": mass}  # fmt: skip
     task = ControlTask.model_validate({"plant": plant})
@@ -296,15 +326,16 @@ class Greedy:
         return Solution(torch.as_tensor(speeds), 0.0)
 
 
-def contender(name: str, one: Scene, models: Path | None) -> tuple[Controller, MujocoPlant]:
+def contender(name: str, one: Scene, fits: Path | None) -> tuple[Controller, MujocoPlant]:
     """Return a contender for an object, and the plant."""
     if name in ("mppi", "gauss-newton", "both"):
         controller = Controller(one.model, one.task, name)  # pyright: ignore[reportArgumentType]
         return controller, MujocoPlant(controller.task_world)
-    if name == "fitted":
-        if models is None:
-            sys.exit("fitted needs --models FOLDER with a model for each object.")
-        controller = Controller(read_model(models / one.name), one.task.model_copy(update={"object": None}))
+    if name in ("true", "fitted", "fitted + draws"):
+        if fits is None:
+            sys.exit(f"{name} needs --fits FOLDER with an output of 'cgwm demo --scene control' for each object.")
+        model = one.model if name == "true" else read_model(fits / one.name / "model")
+        controller = Controller(model, one.task, draws=DRAWS * name.endswith("draws"))
         return controller, MujocoPlant(controller.task_world)
     kind = {"cem": InMujoco, "cem + pushes": InMujoco, "open loop": Played, "greedy": Controller}[name]
     controller = kind(one.model, one.task)
@@ -352,9 +383,9 @@ def open_loop(controller: Played, one: Scene, seed: int) -> None:
     controller.targets = Targets(times_s=times, values_m=np.concatenate((first[None], found.column("target_m"))))
 
 
-def measure(name: str, one: Scene, seed: int, clock: str, models: Path | None) -> dict[str, Any]:
+def measure(name: str, one: Scene, seed: int, clock: str, fits: Path | None) -> dict[str, Any]:
     """Return the figures of one run."""
-    controller, plant = prepared(name, one, models)
+    controller, plant = prepared(name, one, fits)
     if isinstance(controller, Played):
         open_loop(controller, one, seed)
     if clock == "cpu":
@@ -376,14 +407,15 @@ def measure(name: str, one: Scene, seed: int, clock: str, models: Path | None) -
     }
 
 
-_PREPARED: dict[tuple[str, str], tuple[Controller, MujocoPlant]] = {}
+_PREPARED: dict[tuple[str, str, str], tuple[Controller, MujocoPlant]] = {}
 
 
-def prepared(name: str, one: Scene, models: Path | None) -> tuple[Controller, MujocoPlant]:
+def prepared(name: str, one: Scene, fits: Path | None) -> tuple[Controller, MujocoPlant]:
     """Return a contender, made once."""
-    if (name, one.name) not in _PREPARED:
-        _PREPARED[name, one.name] = contender(name, one, models)
-    return _PREPARED[name, one.name]
+    key = (name, one.name, one.task.plant.model_dump_json())
+    if key not in _PREPARED:
+        _PREPARED[key] = contender(name, one, fits)
+    return _PREPARED[key]
 
 
 def _charge_processors(controller: Controller) -> None:
@@ -407,12 +439,14 @@ def rows(store: Store) -> Iterator[list[str]]:
     for (clock, name, obj), runs in sorted(found.items()):
         good = [run for run in runs.values() if run["ended"] == "success"]
         low, high = wilson(len(good), len(runs))
-        reference = found.get((clock, "mppi", obj), {})
+        against = f"{TRUE} | {error}" if (error := name.partition(" | ")[2]) else TRUE
+        against = against if (clock, against, obj) in found else "mppi"
+        reference = found.get((clock, against, obj), {})
         both = [
             (runs[key]["ended"] == "success", reference[key]["ended"] == "success") for key in runs if key in reference
         ]
         paired = ""
-        if both and name != "mppi":
+        if both and name != against:
             change = np.array([float(a) - float(b) for a, b in both])
             half = 1.96 * change.std(ddof=1) / math.sqrt(len(change)) if len(change) > 1 else math.nan
             paired = f"{100 * change.mean():+.0f} +- {100 * half:.0f}"
@@ -426,8 +460,8 @@ def rows(store: Store) -> Iterator[list[str]]:
                f"{100 * late:.0f}", f"{middle['load']:.1f}"]  # fmt: skip
 
 
-HEADER = ("clock", "contender", "object", "reached", "rate, % (95 %)", "against mppi, points", "time, s (median)",
-          "plan, CPU ms", "plan, wall ms", "late, %", "load")  # fmt: skip
+HEADER = ("clock", "contender", "object", "reached", "rate, % (95 %)", "against true or mppi, points",
+          "time, s (median)", "plan, CPU ms", "plan, wall ms", "late, %", "load")  # fmt: skip
 
 
 def main() -> None:
@@ -438,7 +472,8 @@ def main() -> None:
     parser.add_argument("--contenders", default="mppi,both,gauss-newton,cem,cem + pushes,open loop,greedy")
     parser.add_argument("--clock", choices=("real", "ideal", "cpu"), default="real")
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--models", type=Path, default=None, help="folder of fitted models, FOLDER/<object>")
+    parser.add_argument("--fits", type=Path, default=None, help="folder of outputs of 'cgwm demo --scene control'")
+    parser.add_argument("--plants", default="nominal", help="names of PLANTS, or all")
     parser.add_argument("--store", type=Path, default=None)
     parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
     given = parser.parse_args()
@@ -450,12 +485,20 @@ def main() -> None:
         return
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     with tempfile.TemporaryDirectory() as folder:
-        scenes = [scene(name, Path(folder)) for name in given.objects.split(",")]
+        scenes = [scene(name, Path(folder), given.fits) for name in given.objects.split(",")]
+        plants = PLANTS if given.plants == "all" else given.plants.split(",")
         for seed in range(given.seeds):
-            for one in scenes:
+            for plant, one in product(plants, scenes):
+                error, changed = "" if plant == "nominal" else f" | {plant}", with_error(one, plant)
                 for name in given.contenders.split(","):
-                    key = f"{one.name}/{name}/{given.clock}/{seed}"
-                    store.result(key, lambda n=name, o=one, s=seed: measure(n, o, s, given.clock, given.models))
+                    key = f"{one.name}/{name}{error}/{given.clock}/{seed}"
+                    store.result(key, lambda n=name, o=changed, s=seed: measure(n, o, s, given.clock, given.fits))
+
+
+def with_error(one: Scene, plant: str) -> Scene:
+    """Return an object with an error of `PLANTS`."""
+    task = one.task.model_copy(update={"plant": one.task.plant.model_copy(update=PLANTS[plant])})
+    return replace(one, task=task)
 
 
 if __name__ == "__main__":
