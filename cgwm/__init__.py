@@ -17,6 +17,7 @@ _PUBLIC = {
     "ControlPlan": ".pipeline.control",
     "ControlState": ".pipeline.control",
     "Controller": ".pipeline.control",
+    "HandController": ".pipeline.control",
     "DamagedShardError": ".schemas",
     "InputDataError": ".schemas",
     "Model": ".datasets.models",
@@ -89,7 +90,17 @@ if TYPE_CHECKING:
     from .datasets.models import Model, read_model
     from .pipeline.calibrate import calibrate
     from .pipeline.compare import compare
-    from .pipeline.control import ClosedLoop, Controller, ControlPlan, ControlState, Reach, Targets, Velocity, control
+    from .pipeline.control import (
+        ClosedLoop,
+        Controller,
+        ControlPlan,
+        ControlState,
+        HandController,
+        Reach,
+        Targets,
+        Velocity,
+        control,
+    )
     from .pipeline.demo import (
         run_control_demo,
         run_demo,
@@ -135,6 +146,7 @@ __all__ = [
     "ControlState",
     "Controller",
     "DamagedShardError",
+    "HandController",
     "InputDataError",
     "Model",
     "NotConvergedError",

@@ -47,7 +47,9 @@ def control(
     ] = False,
     overwrite: Overwrite = False,
     print_task: Annotated[
-        Literal["push"] | None, typer.Option("--print-task", help="Print a task to edit, and stop.", show_default=False)
+        Literal["push", "hand", "turn"] | None,
+        typer.Option("--print-task", help="Print a task to edit, and stop. push: a finger pushes the object to a pose; "
+                     "hand: a hand turns it to random orientations; turn: a hand turns it once.", show_default=False),
     ] = None,
     trust_effects: TrustEffects = "",
 ) -> None:  # fmt: skip
@@ -55,9 +57,9 @@ def control(
     from ..schemas import UsageError
 
     if print_task is not None:
-        from ..schemas import TASKS, task_toml
+        from ..schemas import HAND_TASKS, TASKS, task_toml
 
-        emit(TASKS[print_task], lambda found: task_toml(found).rstrip("\n"))
+        emit({**TASKS, **HAND_TASKS}[print_task], lambda found: task_toml(found).rstrip("\n"))
         return
     missing = [name for name, value in (("MODEL", model), ("TASK.toml", task), ("--out RUN", out)) if value is None]
     if missing or model is None or task is None or out is None:

@@ -30,11 +30,13 @@ Positive = Annotated[float, Field(gt=0, le=1e9)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
-class _Section(FileModel):
+class TaskSection(FileModel):
+    """A part of a task."""
+
     model_config = ConfigDict(use_attribute_docstrings=True)  # `task_toml` writes them as comments
 
 
-class RobotSection(_Section):
+class RobotSection(TaskSection):
     """What acts: a finger, a ball that moves in the plane on position servos."""
 
     kind: Literal["finger"] = "finger"
@@ -47,7 +49,7 @@ class RobotSection(_Section):
     """Height of its centre above the ground [m]."""
 
 
-class ServoSection(_Section):
+class ServoSection(TaskSection):
     """The servos of the plant's joints."""
 
     stiffness_n_m: Positive = 2000.0
@@ -58,7 +60,7 @@ class ServoSection(_Section):
     """Mass that each servo moves [kg]."""
 
 
-class LimitsSection(_Section):
+class LimitsSection(TaskSection):
     """Limits that no command exceeds."""
 
     speed_m_s: Positive = 0.3
@@ -81,7 +83,7 @@ class LimitsSection(_Section):
         return self
 
 
-class GoalSection(_Section):
+class GoalSection(TaskSection):
     """Where the object is wanted."""
 
     position_m: Place = (0.0, 0.0)
@@ -90,7 +92,7 @@ class GoalSection(_Section):
     """Turn about the ground's normal, relative to the photos [deg]."""
 
 
-class StartSection(_Section):
+class StartSection(TaskSection):
     """Where a run begins; what is left out is drawn for each seed."""
 
     within_m: Length = 0.25
@@ -103,7 +105,7 @@ class StartSection(_Section):
     """Position of the finger [m]; by default 5 cm beside the object, in any direction."""
 
 
-class CostsSection(_Section):
+class CostsSection(TaskSection):
     """What a plan costs: squares of errors in these units."""
 
     position_m: Length = 0.01
@@ -119,7 +121,7 @@ class CostsSection(_Section):
     too far away to touch the object within the horizon."""
 
 
-class PlannerSection(_Section):
+class PlannerSection(TaskSection):
     """How plans are made."""
 
     control_hz: Annotated[float, Field(ge=0.1, le=10_000)] = 30.0
@@ -151,7 +153,7 @@ class PlannerSection(_Section):
         return self
 
 
-class SuccessSection(_Section):
+class SuccessSection(TaskSection):
     """When the goal is reached."""
 
     position_m: Length = 0.01
@@ -164,7 +166,7 @@ class SuccessSection(_Section):
     """Time after which a run has failed [s]."""
 
 
-class PlantSection(_Section):
+class PlantSection(TaskSection):
     """What the commands act on."""
 
     kind: Literal["model", "mujoco"] = "model"
@@ -193,7 +195,7 @@ class PlantSection(_Section):
     """Time step of MuJoCo [s]."""
 
 
-class ControlTask(_Section):
+class ControlTask(TaskSection):
     """A task of control. Lengths are in metres, angles in degrees; the plane is the model's ground."""
 
     format: Literal["cgwm-task/1"] = TASK_FORMAT
@@ -240,17 +242,17 @@ def read_task(path: Path) -> ControlTask:
     return task
 
 
-def task_toml(task: ControlTask) -> str:
+def task_toml(task: TaskSection) -> str:
     """Return a task as TOML to edit: fields are explained, unset ones commented out."""
     fields = type(task).model_fields
     lines = [f"# {_told(type(task).__doc__ or '')}"]
     for name, field in fields.items():
         value = getattr(task, name)
-        if not isinstance(value, _Section):
+        if not isinstance(value, TaskSection):
             lines += _entry(name, value, field.description or "The version of this format.")
     for name in fields:
         section = getattr(task, name)
-        if isinstance(section, _Section):
+        if isinstance(section, TaskSection):
             lines += ["", f"# {_told(type(section).__doc__ or '')}", f"[{name}]"]
             for key, field in type(section).model_fields.items():
                 lines += _entry(key, getattr(section, key), field.description or "")
@@ -285,7 +287,7 @@ class ControlRun(FileModel):
     """One run of a task."""
 
     seed: int
-    ended: Literal["success", "timeout", "bad_states", "diverged"]
+    ended: Literal["success", "timeout", "bad_states", "diverged", "dropped"]
     """Why it ended."""
     time_s: Annotated[float, Field(ge=0, le=1e6)]
     """Time of the plant at its end [s]."""
@@ -295,6 +297,8 @@ class ControlRun(FileModel):
     """At its end [deg]."""
     start_position_error_m: Annotated[float, Field(ge=0, le=1e8)]
     start_turn_error_deg: Annotated[float, Field(ge=0, le=180)]
+    goals: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """Goals that were reached, of a hand."""
     commands: int
     """Commands that were sent."""
     plans: int
@@ -322,6 +326,8 @@ class ControlResult(FileModel):
     solver: SolverName
     clock: ClockName
     plant: Literal["model", "mujoco"]
+    goals: int = 0
+    """Goals that were reached in all runs, of a hand."""
     draws: int
     """Draws of the model that each plan is evaluated under; 0: the estimate alone."""
     device: str

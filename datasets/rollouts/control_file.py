@@ -11,11 +11,13 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import h5py
 import numpy as np
 
 from ...schemas import InputDataError
+from ...schemas.documents import parse_json
 from ..io.hdf5_files import hdf5_faults, open_hdf5, own_objects, require_stored
 from .rollouts import Node
 
@@ -32,7 +34,7 @@ class RunArray:
     """An array of a run."""
 
     tail: tuple[int | str, ...]
-    """Its shape after the rows; N is the number of pieces of a plan."""
+    """Its shape after the rows; N is the number of pieces of a plan, J that of the joints."""
     unit: str
     """Its unit."""
     text: str
@@ -61,6 +63,25 @@ COMMANDS: Mapping[str, RunArray] = {
     "control/force": _array((3,), "N", "Mean force of the finger on the object during the command, world frame."),
 }
 """Arrays with one row for each command."""
+_HAND_OBSERVED = {
+    "object": _OBSERVED["object"],
+    "joints": _array(("J",), "rad", "Joints at the command, in the order of the file."),
+    "goal": _array((4,), "1", "Orientation that is wanted, quaternion w x y z."),
+}
+HAND_COMMANDS: Mapping[str, RunArray] = {
+    "actions": _array(("J",), "1", "Change of the targets by the largest one of a command, by joint, -1 to 1."),
+    "rewards": COMMANDS["rewards"],
+    "dones": COMMANDS["dones"],
+    "states": _array(("S",), "SI", "time, object (pose, velocity, omega_body), joints, their speeds."),
+    **{f"obs/{name}": entry for name, entry in _HAND_OBSERVED.items()},
+    **{f"next_obs/{name}": entry for name, entry in _HAND_OBSERVED.items()},
+    "control/time": COMMANDS["control/time"],
+    "control/target": _array(("J",), "rad", "Targets of the joints at the end of the command."),
+    "control/position_error": COMMANDS["control/position_error"],
+    "control/turn_error": COMMANDS["control/turn_error"],
+    "control/reached": _array((), "1", "1 where the goal was reached by this command."),
+}
+"""The same of a hand with J joints; S = 14 + 2 J."""
 PLANS: Mapping[str, RunArray] = {
     "plans/state_time": _array((), "s", "Time of the state that the plan was made from."),
     "plans/acts_time": _array((), "s", "Time from which it was made to act."),
@@ -69,7 +90,7 @@ PLANS: Mapping[str, RunArray] = {
     "plans/late": _array((), "1", "1 where it took longer than a command."),
     "plans/cost": _array((), "1", "Its cost."),
     "plans/times": _array(("N",), "s", "Ends of its pieces."),
-    "plans/targets": _array(("N", 2), "m", "Targets there, x y."),
+    "plans/targets": _array(("N", "J"), "m, rad", "Targets of the joints there."),
     "plans/object": _array(("N", 7), "m, 1", f"Prediction of the object there: {_POSE}."),
 }
 """Arrays with one row for each plan."""
@@ -77,7 +98,7 @@ PLANS: Mapping[str, RunArray] = {
 
 @dataclass(frozen=True, kw_only=True)
 class RunTables:
-    """One run, by the names of `COMMANDS` and `PLANS`."""
+    """One run, by the names of `COMMANDS`, or `HAND_COMMANDS`, and `PLANS`."""
 
     seed: int
     """Seed of the run."""
@@ -85,6 +106,10 @@ class RunTables:
     """Why it ended."""
     arrays: Mapping[str, np.ndarray]
     """The arrays."""
+    robot: Literal["finger", "hand"] = "finger"
+    """Robot, which says whether its arrays are those of `COMMANDS` or of `HAND_COMMANDS`."""
+    joints: tuple[str, ...] = ("x", "y")
+    """Names of the joints, in the order of the arrays."""
 
 
 def write_runs(path: Path, runs: Sequence[RunTables], task_toml: str, creator: str) -> None:
@@ -93,11 +118,12 @@ def write_runs(path: Path, runs: Sequence[RunTables], task_toml: str, creator: s
         file.attrs.update({"format": RUNS_FORMAT, "creator": creator, "task_toml": task_toml, "convention": CONVENTION})
         data = file.create_group("data")
         data.attrs["env_args"] = json.dumps({"env_name": "cgwm", "env_type": 2, "type": 2, "env_kwargs": {}})
+        data.attrs.update({"robot": runs[0].robot, "joints": json.dumps(runs[0].joints)})
         data.attrs["total"] = sum(len(run.arrays["actions"]) for run in runs)
         for run in runs:
             demo = data.create_group(f"demo_{run.seed}")
             demo.attrs.update({"num_samples": len(run.arrays["actions"]), "seed": run.seed, "ended": run.ended})
-            for name, entry in {**COMMANDS, **PLANS}.items():
+            for name, entry in {**_commands_of(run.robot), **PLANS}.items():
                 made = demo.create_dataset(name, data=run.arrays[name], track_times=False)
                 made.attrs.update({"unit": entry.unit, "description": entry.text})
         good = [f"demo_{run.seed}".encode() for run in runs if run.ended == "success"]
@@ -117,27 +143,46 @@ def read_runs(path: Path) -> list[RunTables]:
             if isinstance(item, h5py.Dataset):
                 require_stored(item, f"{path}: {place}")
         root: Node = file
-        return [_read(path, name, root[f"data/{name}"]) for name in sorted(root["data"], key=_number)]
+        robot = "hand" if str(root["data"].attrs.get("robot", "finger")) == "hand" else "finger"
+        joints = _joints(path, str(root["data"].attrs.get("joints", '["x", "y"]')))
+        names = sorted(root["data"], key=_number)
+        return [_read(path, name, root[f"data/{name}"], robot, joints) for name in names]
+
+
+def _joints(path: Path, text: str) -> tuple[str, ...]:
+    """Return the names of the joints from the attribute `joints`."""
+    names = parse_json(f'{{"joints": {text}}}', path).get("joints")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputDataError(
+            f"{path}: its attribute 'joints' is {text[:60]}.", "a list of names.", "take the original."
+        )
+    return tuple(map(str, names))
+
+
+def _commands_of(robot: str) -> Mapping[str, RunArray]:
+    return HAND_COMMANDS if robot == "hand" else COMMANDS
 
 
 def _number(name: str) -> int:
     return int(name.removeprefix("demo_")) if name.removeprefix("demo_").isdigit() else -1
 
 
-def _read(path: Path, name: str, demo: Node) -> RunTables:
-    arrays = {}
+def _read(path: Path, name: str, demo: Node, robot: Literal["finger", "hand"], names: tuple[str, ...]) -> RunTables:
+    arrays, table_of_commands = {}, _commands_of(robot)
     if _number(name) < 0:
         raise InputDataError(f"{path}: data/{name}: no run.", "groups demo_<seed> in data.")
-    for key in (*COMMANDS, *PLANS):
+    for key in (*table_of_commands, *PLANS):
         if key not in demo or not isinstance(demo[key], h5py.Dataset):
             raise InputDataError(f"{path}: data/{name} lacks the array '{key}'.", todo="take the original file.")
         arrays[key] = demo[key][()]
     sizes = {"N": arrays["plans/times"].shape[-1] if arrays["plans/times"].ndim > 1 else 0}
-    for table, rows in ((COMMANDS, len(arrays["actions"])), (PLANS, len(arrays["plans/cost"]))):
+    sizes |= {"J": len(names), "S": 14 + 2 * len(names)}
+    for table, rows in ((table_of_commands, len(arrays["actions"])), (PLANS, len(arrays["plans/cost"]))):
         for key, entry in table.items():
             wanted = (rows, *(sizes.get(size, size) if isinstance(size, str) else size for size in entry.tail))
             if arrays[key].shape != wanted:
                 raise InputDataError(
                     f"{path}: data/{name}/{key} has the shape {arrays[key].shape}.", f"{wanted}.", "take the original."
                 )
-    return RunTables(seed=_number(name), ended=str(demo.attrs.get("ended", "")), arrays=arrays)
+    ended = str(demo.attrs.get("ended", ""))
+    return RunTables(seed=_number(name), ended=ended, arrays=arrays, robot=robot, joints=names)

@@ -1,7 +1,19 @@
 """A fitted model as the environment of a controller, and as the model by which one plans (`cgwm control`)."""
 
 from .closed_loop import ClosedLoop, Reach, Targets, Velocity
-from .controller import Controller, ControlPlan, ControlState
+from .controller import Controller
+from .hand_controller import HandController
+from .planning import ControlPlan, ControlState
 from .stage import control
 
-__all__ = ["ClosedLoop", "ControlPlan", "ControlState", "Controller", "Reach", "Targets", "Velocity", "control"]
+__all__ = [
+    "ClosedLoop",
+    "ControlPlan",
+    "ControlState",
+    "Controller",
+    "HandController",
+    "Reach",
+    "Targets",
+    "Velocity",
+    "control",
+]

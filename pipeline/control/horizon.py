@@ -34,6 +34,18 @@ class Targets:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Forecast:
+    """What the model predicts of a plan."""
+
+    times_s: Array
+    """Times [s], shape (M + 1,)."""
+    position_m: Array
+    """Position of the object [m], shape (M + 1, 3)."""
+    quat_wxyz: Array
+    """Its orientation, body to world, shape (M + 1, 4)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Horizon:
     """The time of a plan, cut into pieces whose ends lie at multiples of a constant, so that plans can be shifted."""
 

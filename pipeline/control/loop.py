@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
 
-from ...schemas import JOINTS, ClockName, NotConvergedError
+from ...schemas import JOINTS, ClockName, HandPlantSection, NotConvergedError, PlantSection
 from ..geometry.rotation import quat_exp, quat_multiply
-from .controller import Controller, ControlPlan, ControlState
+from .controller import Controller
 from .horizon import Array
+from .planning import ControlPlan, ControlState, PlanningController
 from .plant import Plant, Truth, start_of
 
-Ended = Literal["success", "timeout", "bad_states", "diverged"]
+Ended = Literal["success", "timeout", "bad_states", "diverged", "dropped"]
 
 
 @dataclass
@@ -29,6 +30,8 @@ class Recording:
     """Why it ended."""
     late: int = 0
     """Plans that came after the command that they were for."""
+    goals: int = 0
+    """Goals that were reached, of a task that has several."""
     held: int = 0
     """States that were missing, stale or no numbers."""
     commands: dict[str, list[Any]] = field(default_factory=dict)
@@ -47,37 +50,46 @@ class Recording:
             table.setdefault(name, []).append(value)
 
 
+class Measured(Protocol):
+    """A true state that can be measured."""
+
+    @property
+    def position_m(self) -> Array:
+        """Origin of the object's frame [m], shape (3,)."""
+        ...
+
+    @property
+    def quat_wxyz(self) -> Array:
+        """Orientation of the object, body to world, shape (4,)."""
+        ...
+
+    def measured(self, time_s: float, position_m: Array, quat_wxyz: Array) -> ControlState:
+        """Return the state as it is measured, with a pose of the object that has errors."""
+        ...
+
+
 class Sensor:
     """Measured states of a plant: late by a constant delay, with noise.
 
     Args:
-        controller: The controller, whose task has the delay and the noise.
+        plant: The section of the task that has delay and noise.
+        interval_s: Length of a command [s].
         seed: Seed of the noise.
     """
 
-    def __init__(self, controller: Controller, seed: int) -> None:
-        plant = controller.task.plant
-        self._late = round(plant.delay_s / controller.interval_s)
-        self._interval_s = controller.interval_s
+    def __init__(self, plant: PlantSection | HandPlantSection, interval_s: float, seed: int) -> None:
+        self._late = round(plant.delay_s / interval_s)
         self._noise = plant.noise_m, math.radians(plant.noise_deg)
         self._rng = np.random.default_rng([seed, 3])
         self._states: deque[ControlState] = deque(maxlen=self._late + 1)
 
-    def seen(self, time_s: float, truth: Truth) -> ControlState:
+    def seen(self, time_s: float, truth: Measured) -> ControlState:
         """Return the newest state that has arrived at a time [s]; at the start the first one."""
         place, turn = self._noise
         quat = torch.as_tensor(truth.quat_wxyz)
         shaken = quat_multiply(quat, quat_exp(torch.as_tensor(self._rng.normal(0.0, 1.0, 3) * turn)))
-        self._states.append(
-            ControlState(
-                time_s=time_s,
-                joints=dict(zip(JOINTS, map(float, truth.finger_m), strict=True)),
-                position_m=truth.position_m + self._rng.normal(0.0, 1.0, 3) * place,
-                quat_wxyz=shaken.numpy() if turn else truth.quat_wxyz,
-                velocity_m_s=truth.velocity_m_s,
-                omega_body_rad_s=truth.omega_body_rad_s,
-            )
-        )
+        position = truth.position_m + self._rng.normal(0.0, 1.0, 3) * place
+        self._states.append(truth.measured(time_s, position, shaken.numpy() if turn else truth.quat_wxyz))
         return self._states[0]
 
 
@@ -100,16 +112,16 @@ def run(controller: Controller, plant: Plant, seed: int, clock: ClockName) -> Re
     task, interval = controller.task, controller.interval_s
     controller.restart(seed)
     truth = plant.reset(*start_of(controller.task_world, seed))
-    sensor, recording = Sensor(controller, seed), Recording(seed)
+    sensor, recording = Sensor(task.plant, interval, seed), Recording(seed)
     command = dict(zip(JOINTS, map(float, truth.finger_m), strict=True))
-    waiting, acting, within = _Waiting(interval, clock), None, 0.0
+    waiting, acting, within = Waiting(interval, clock), None, 0.0
     for number in range(math.ceil(task.success.timeout_s / interval - 1e-9)):
         now = number * interval
         acting = waiting.arrived(now) or acting
         if waiting.free:
             plan = controller.plan(sensor.seen(now, truth), now if clock == "ideal" else now + interval)
             if plan is not None:
-                _note_plan(recording, controller, plan, waiting.begin(now, plan))
+                note_plan(recording, controller, plan, waiting.begin(now, plan), task.planner.knots)
                 acting = waiting.arrived(now) or acting
         else:
             sensor.seen(now, truth)
@@ -135,7 +147,7 @@ def run(controller: Controller, plant: Plant, seed: int, clock: ClockName) -> Re
     return recording
 
 
-class _Waiting:
+class Waiting:
     """The plan that is being made, and when it acts.
 
     Args:
@@ -213,9 +225,10 @@ def _note_command(
     )
 
 
-def _note_plan(recording: Recording, controller: Controller, plan: ControlPlan, late: bool) -> None:
+def note_plan(recording: Recording, controller: PlanningController, plan: ControlPlan, late: bool, knots: int) -> None:
     """Record a plan and what the model predicts of it, at the ends of its last `knots` pieces."""
-    found, knots = controller.forecast(), controller.task.planner.knots
+    found, times = controller.forecast(), plan.targets.times_s[-knots:]
+    index = np.searchsorted(found.times_s, times - 1e-9).clip(max=len(found.times_s) - 1)
     recording.add(
         "plans",
         state_s=plan.state_s,
@@ -224,8 +237,8 @@ def _note_plan(recording: Recording, controller: Controller, plan: ControlPlan, 
         cpu_s=plan.cpu_s,
         late=late,
         cost=plan.cost,
-        times_s=plan.targets.times_s[-knots:],
+        times_s=times,
         targets_m=plan.targets.values_m[-knots:],
-        position_m=found.position_m[-knots:],
-        quat_wxyz=found.quat_wxyz[-knots:],
+        position_m=found.position_m[index],
+        quat_wxyz=found.quat_wxyz[index],
     )

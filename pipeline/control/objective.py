@@ -16,9 +16,12 @@ from ..physics.engine import rollout
 from ..physics.kinematic import Drive
 from ..physics.rollout import Rollout
 from ..physics.world import State, World
-from .horizon import Horizon, Targets
+from .horizon import Forecast, Horizon, Targets
+from .proposals import PushProposals
 from .task_world import TaskWorld
 
+Draw = Callable[[np.random.Generator, int], np.ndarray]
+"""Returns up to a number of proposals (n, N, joints)."""
 WORST = 0.25
 """Share of the draws that count where the worst ones do."""
 
@@ -47,6 +50,27 @@ class Objective(Protocol):
 
     def residuals(self, values: Tensor, draws: Tensor) -> Tensor:
         """Return residuals (b, R), whose squares add up to the cost, of sequences (b, N, joints) under draws (b,)."""
+        ...
+
+
+class PlanObjective(Objective, Protocol):
+    """The cost of sequences from a state on, with the targets that a sequence stands for."""
+
+    @property
+    def acts_s(self) -> float:
+        """Time from which the sequences act [s]."""
+        ...
+
+    def targets(self, values: Tensor) -> Targets:
+        """Return the targets of a sequence (N, joints) over the whole horizon."""
+        ...
+
+    def forecast(self, values: Tensor) -> Forecast:
+        """Return what the model predicts of a sequence (N, joints)."""
+        ...
+
+    def propose(self, warm: Tensor) -> Draw:
+        """Return the source of sequences other than the plan before, shape (N, joints)."""
         ...
 
 
@@ -95,12 +119,28 @@ class PushObjective:
         """Number of draws of the model."""
         return self.worlds.draws
 
+    @property
+    def acts_s(self) -> float:
+        """See :class:`PlanObjective`."""
+        return float(self.horizon.chosen_s[0])
+
     @torch.no_grad()
     def costs(self, values: Tensor) -> Tensor:
         """See :class:`Objective`."""
-        every = torch.arange(self.draws).repeat(len(values))
-        squares = self.residuals(values.repeat_interleave(self.draws, 0), every).square().sum(-1)
-        return _risk(squares.nan_to_num(nan=math.inf).reshape(-1, self.draws), self.task.planner.risk)
+        return costs_of(self, values, self.task.planner.risk)
+
+    def propose(self, warm: Tensor) -> Draw:
+        """See :class:`PlanObjective`."""
+        return PushProposals(objective=self).draw
+
+    def forecast(self, values: Tensor) -> Forecast:
+        """See :class:`PlanObjective`."""
+        motion, index = self.predicted(values[None], torch.zeros(1, dtype=torch.long)), self.task_world.object
+        return Forecast(
+            times_s=self.horizon.times_s,
+            position_m=motion.position_m[0, :, index].numpy(),
+            quat_wxyz=motion.quat_wxyz[0, :, index].numpy(),
+        )
 
     def residuals(self, values: Tensor, draws: Tensor) -> Tensor:
         """See :class:`Objective`."""
@@ -183,6 +223,20 @@ def limits_of(task: ControlTask) -> tuple[Tensor, Tensor]:
     """Return the smallest and the largest targets (2,) of the joints [m]."""
     pairs = torch.tensor([task.limits.joints[name] for name in ("x", "y")], dtype=torch.float64)
     return pairs[:, 0], pairs[:, 1]
+
+
+def costs_of(objective: Objective, values: Tensor, risk: str) -> Tensor:
+    """Return the costs (B,) of sequences (B, N, joints) from their residuals under all draws.
+
+    Args:
+        objective: The objective.
+        values: The sequences.
+        risk: mean or worst_quarter.
+    """
+    draws = objective.draws
+    every = torch.arange(draws).repeat(len(values))
+    squares = objective.residuals(values.repeat_interleave(draws, 0), every).square().sum(-1)
+    return _risk(squares.nan_to_num(nan=math.inf).reshape(-1, draws), risk)
 
 
 def _risk(costs: Tensor, risk: str) -> Tensor:

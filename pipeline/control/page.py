@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...datasets.rollouts.control_file import RunTables
-from ...schemas import ControlResult, ControlRun, ControlTask
+from ...schemas import AnyTask, ControlResult, ControlRun, ControlTask, HandTask
 from ..report.page import cautions, facts, film, fixed, folded, number, page, paragraph, section, table, text, way_link
 from ..report.plots import Plot, Series, legend, plot_svg
 from .film import AHEAD_S
@@ -31,9 +31,7 @@ class PageRun:
     """Its arrays."""
 
 
-def control_html(
-    result: ControlResult, task: ControlTask, runs: Sequence[PageRun], webm: bytes | None, sheet: str
-) -> str:
+def control_html(result: ControlResult, task: AnyTask, runs: Sequence[PageRun], webm: bytes | None, sheet: str) -> str:
     """Return the page of runs.
 
     Args:
@@ -47,26 +45,29 @@ def control_html(
         f"<h1>cgwm control · {text(Path(result.task).name)} · {text(result.object)}</h1>",
         f'<p class="verdict">{text(result.sentence)}</p>',
         cautions([*result.warnings, *([result.advice] if result.advice else [])]),
-        section("Runs", _table(result)),
+        section("Runs", _table(result, runs)),
         _film(result, webm, sheet),
         section("Errors", *_errors(task, runs)),
-        section("Way of object and finger", *_ways(task, runs)),
+        _joints(runs) if isinstance(task, HandTask) else section("Way of object and finger", *_ways(task, runs)),
         _times(result, task, runs),
-        section("Contact force", *_forces(runs)),
+        "" if isinstance(task, HandTask) else section("Contact force", *_forces(runs)),
         section("What was asked for", _asked(result)),
     ]
     return page(f"cgwm control: {Path(result.task).name}", [piece for piece in body if piece])
 
 
-def _table(result: ControlResult) -> str:
+def _table(result: ControlResult, runs: Sequence[PageRun]) -> str:
     """Return a table of the runs."""
     real = result.clock == "real"
-    header = ["seed", "ended", "time [s]", "position error [mm]", "turn error [deg]", "commands", "largest force [N]"]
+    hand = any("obs/joints" in run.tables.arrays for run in runs)
+    header = ["seed", "ended", "time [s]", "position error [mm]", "turn error [deg]", "commands"]
+    header += ["goals"] if hand else ["largest force [N]"]
     header += ["late plans", "plan, median [ms]", "plan, 95 % [ms]"] if real else []
     rows = []
     for run in result.runs:
         row = [str(run.seed), run.ended.replace("_", " "), fixed(run.time_s), fixed(run.position_error_m, 1, 1e3)]
-        row += [fixed(run.turn_error_deg), str(run.commands), number(run.largest_force_n)]
+        row += [fixed(run.turn_error_deg), str(run.commands)]
+        row += [str(run.goals)] if hand else [number(run.largest_force_n)]
         row += [f"{run.late_plans} of {run.plans}", fixed(run.plan_ms), fixed(run.plan_ms_95)] if real else []
         rows.append(row)
     return table(header, rows, numeric=(0, *range(2, len(header))), sorts=True)
@@ -85,16 +86,23 @@ def _film(result: ControlResult, webm: bytes | None, sheet: str) -> str:
     return section("Plant and prediction", paragraph(told), shown, picture, facts([("film", way_link(FILM, FILM))]))
 
 
-def _errors(task: ControlTask, runs: Sequence[PageRun]) -> list[str]:
+def _errors(task: AnyTask, runs: Sequence[PageRun]) -> list[str]:
     """Return plots of the errors over time."""
     pieces, goal = [], task.success
+    place_mm = None if goal.position_m is None else 1e3 * goal.position_m
     for name, title, scale, bar in (
-        ("control/position_error", "Position error [mm]", 1e3, 1e3 * goal.position_m),
+        (
+            "control/position_error",
+            "Position error [mm]",
+            1e3,
+            place_mm,
+        ),
         ("control/turn_error", "Turn error [deg]", 1.0, goal.turn_deg),
     ):
         lines = _lines(runs, name, scale)
         end = max((points[-1][0] for one in lines if (points := one.points)), default=1.0)
-        lines.append(Series(name="success", points=((0.0, bar), (end, bar)), color="good", kind="dashed"))
+        if bar is not None:
+            lines.append(Series(name="success", points=((0.0, bar), (end, bar)), color="good", kind="dashed"))
         pieces += [plot_svg(Plot(title=title, x="time [s]", series=lines, zero=True)), legend(lines)]
     return pieces
 
@@ -126,7 +134,23 @@ def _ways(task: ControlTask, runs: Sequence[PageRun]) -> list[str]:
     return [told, plot_svg(Plot(title="y [m]", x="x [m]", series=lines, equal=True)), legend(lines)]
 
 
-def _times(result: ControlResult, task: ControlTask, runs: Sequence[PageRun]) -> str:
+def _joints(runs: Sequence[PageRun]) -> str:
+    """Return the section of the joints' values and targets over time, of the first run."""
+    arrays = runs[0].tables.arrays
+    time, names = arrays["control/time"], runs[0].tables.joints
+    moved = np.argsort(-np.ptp(arrays["obs/joints"], axis=0))[:MOST_LINES] if len(time) else np.arange(0)
+    lines = []
+    for index, joint in enumerate(moved):
+        color = f"m{index % 6}"
+        values, target = arrays["obs/joints"][:, joint], arrays["control/target"][:, joint]
+        lines.append(Series(name=names[joint], points=_thinned(time, values), color=color))
+        lines.append(Series(name=f"{names[joint]}, target", points=_thinned(time, target), color=color, kind="dashed"))
+    told = f"Seed {runs[0].figures.seed}, the joints that move most of {len(names)}; dashed: their targets."
+    plot = plot_svg(Plot(title="Joint [rad]", x="time [s]", series=lines))
+    return section("Joints", paragraph(told), plot, legend(lines))
+
+
+def _times(result: ControlResult, task: AnyTask, runs: Sequence[PageRun]) -> str:
     """Return the section of plan times; with the ideal clock they do not matter."""
     if result.clock == "ideal":
         told = "Ideal clock: a plan acted at once, however long it took. Pass --clock real for what a robot would see."

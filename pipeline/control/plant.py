@@ -9,10 +9,12 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from ...schemas import JOINTS
 from ..physics.engine import rollout
 from ..physics.world import State, World
 from .horizon import Array
 from .objective import drive_of
+from .planning import ControlState
 from .task_world import TaskWorld, require_start
 
 
@@ -37,6 +39,17 @@ class Truth:
     def finite(self) -> bool:
         """Whether all numbers are finite."""
         return all(bool(np.isfinite(value).all()) for value in vars(self).values())
+
+    def measured(self, time_s: float, position_m: Array, quat_wxyz: Array) -> ControlState:
+        """Return the state as it is measured, with a pose of the object that has errors."""
+        return ControlState(
+            time_s=time_s,
+            joints=dict(zip(JOINTS, map(float, self.finger_m), strict=True)),
+            position_m=position_m,
+            quat_wxyz=quat_wxyz,
+            velocity_m_s=self.velocity_m_s,
+            omega_body_rad_s=self.omega_body_rad_s,
+        )
 
 
 class Plant(Protocol):
@@ -113,16 +126,30 @@ class ModelPlant:
 def _changed(found: TaskWorld) -> World:
     """Return the world of the model with the errors of friction, mass and size that the task gives."""
     world, plant, index = found.world, found.task.plant, found.object
-    body, size, mass = world.bodies[index], plant.size_factor, plant.mass_factor
+    mass = plant.mass_factor
     if plant.mass_kg is not None:
-        mass = mass * plant.mass_kg / float(body.mass)
-    if plant.friction_factor != 1.0 or plant.friction is not None:
-        factor = plant.friction_factor
-        ground = (
-            world.contact.friction if plant.friction is None else torch.full_like(world.gravity[:, 0], plant.friction)
-        )
-        laws = {pair: replace(law, friction=factor * law.friction) for pair, law in world.pair_laws.items()}
-        world = replace(world, contact=replace(world.contact, friction=factor * ground), pair_laws=laws)
+        mass = mass * plant.mass_kg / float(world.bodies[index].mass)
+    if plant.friction is not None:
+        ground = torch.full_like(world.gravity[:, 0], plant.friction)
+        world = replace(world, contact=replace(world.contact, friction=ground))
+    return changed_world(world, index, plant.friction_factor, mass, plant.size_factor)
+
+
+def changed_world(world: World, index: int, friction: float, mass: float, size: float) -> World:
+    """Return a world with factors of all frictions, and of mass and size of a body [1].
+
+    Args:
+        world: The world.
+        index: Index of the body.
+        friction: Factor of the frictions.
+        mass: Factor of the mass.
+        size: Factor of the size.
+    """
+    body = world.bodies[index]
+    if friction != 1.0:
+        laws = {pair: replace(law, friction=friction * law.friction) for pair, law in world.pair_laws.items()}
+        contact = replace(world.contact, friction=friction * world.contact.friction)
+        world = replace(world, contact=contact, pair_laws=laws)
     if size == 1.0 and mass == 1.0:
         return world
     return world.with_body(

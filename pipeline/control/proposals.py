@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .horizon import Array
-from .objective import PushObjective
 from .task_world import outline
+
+if TYPE_CHECKING:
+    from .objective import PushObjective
 
 GAP_M = 0.012
 """Distance from the outline at which a push begins [m]."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,10 +14,7 @@ from ...schemas import SolverName
 from ..optimization.forward_mode import batched_jacobian
 from ..optimization.least_squares import Policy, descend
 from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
-from .objective import Objective
-
-Draw = Callable[[np.random.Generator, int], np.ndarray]
-"""Returns up to a number of proposals (n, N, joints)."""
+from .objective import Draw, Objective
 
 NOISE = (0.03, 0.4)
 """Smallest and largest standard deviation of changed plans in units of the bound; each sample has its own."""
@@ -72,6 +68,10 @@ class Mppi:
 
     samples: int
     """Number of sequences."""
+    noise: tuple[float, float] = NOISE
+    """Smallest and largest standard deviation of changed plans in units of the bound."""
+    alike: int = NOISE_PIECES
+    """Pieces that noise changes alike."""
 
     def solve(self, objective: Objective, warm: Tensor, propose: Draw, rng: np.random.Generator) -> Solution:
         """See :class:`Solver`."""
@@ -79,17 +79,25 @@ class Mppi:
         changed = int(CHANGED * first)
         proposals = _tensor(propose(rng, max(first - changed - 2, 0)), objective)
         values = torch.cat(
-            (warm[None], torch.zeros_like(warm)[None], _changed(warm, changed, objective, rng), proposals)
+            (warm[None], torch.zeros_like(warm)[None], self._changed(warm, changed, objective, rng), proposals)
         )
         values = values.clamp(-objective.bound, objective.bound)
         costs = objective.costs(values)
         best = values[costs.argmin()]
-        near = _changed(best, max(self.samples - first - 1, 1), objective, rng)
+        near = self._changed(best, max(self.samples - first - 1, 1), objective, rng)
         later = objective.costs(near)
         mean = _mean(torch.cat((best[None], near)), torch.cat((costs.min()[None], later)))
         values, costs = torch.cat((values, near, mean[None])), torch.cat((costs, later, objective.costs(mean[None])))
         chosen = costs.argmin()
         return Solution(values[chosen], float(costs[chosen]))
+
+    def _changed(self, values: Tensor, count: int, objective: Objective, rng: np.random.Generator) -> Tensor:
+        """Return sequences (count, N, joints) about one (N, joints), within the bound."""
+        pieces, joints = objective.shape
+        noise = rng.normal(size=(count, -(-pieces // self.alike), joints)).repeat(self.alike, 1)[:, :pieces]
+        size = np.exp(rng.uniform(math.log(self.noise[0]), math.log(self.noise[1]), (count, 1, 1)))
+        changed = values + torch.as_tensor(objective.bound * size * noise)
+        return changed.clamp(-objective.bound, objective.bound)
 
 
 @dataclass(frozen=True)
@@ -116,16 +124,16 @@ class Both:
         return polished if polished.cost < found.cost else found
 
 
-def solver_of(name: SolverName, samples: int) -> Solver:
+def solver_of(name: SolverName, sampling: Mppi) -> Solver:
     """Return the solver of a name.
 
     Args:
         name: mppi, gauss-newton or both.
-        samples: Sequences that sampling compares.
+        sampling: The sampling solver.
     """
     if name == "gauss-newton":
         return GaussNewton()
-    return Mppi(samples) if name == "mppi" else Both(Mppi(samples))
+    return sampling if name == "mppi" else Both(sampling)
 
 
 def descended(objective: Objective, starts: Tensor, policy: Policy) -> Solution:
@@ -183,15 +191,6 @@ class _Blocks(Problem):
         sequences = self.sequences(point.values[rows.owner], rows.groups[rows.owner])
         with torch.no_grad():
             return self.objective.residuals(sequences, rows.items % self.objective.draws).square().sum(-1)
-
-
-def _changed(values: Tensor, count: int, objective: Objective, rng: np.random.Generator) -> Tensor:
-    """Return sequences (count, N, joints) about one (N, joints), within the bound."""
-    pieces, joints = objective.shape
-    noise = rng.normal(size=(count, -(-pieces // NOISE_PIECES), joints)).repeat(NOISE_PIECES, 1)[:, :pieces]
-    size = np.exp(rng.uniform(math.log(NOISE[0]), math.log(NOISE[1]), (count, 1, 1)))
-    changed = values + torch.as_tensor(objective.bound * size * noise)
-    return changed.clamp(-objective.bound, objective.bound)
 
 
 def _mean(values: Tensor, costs: Tensor) -> Tensor:

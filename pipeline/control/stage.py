@@ -19,28 +19,24 @@ from ...datasets.models.fit_inputs import versions
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.control_file import RunTables, write_runs
 from ...schemas import (
+    AnyTask,
     ClockName,
     ControlResult,
     ControlRun,
-    ControlTask,
     InterruptedWork,
     SlowPlansError,
     SolverName,
     UsageError,
+    files_of,
+    read_any_task,
     read_json,
-    read_task,
     task_toml,
 )
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
-from .controller import Controller, ControlState
-from .film import film_of
-from .loop import run
-from .mujoco_plant import MujocoPlant
 from .page import FILM, PAGE, PageRun, control_html
-from .plant import ModelPlant, Plant, start_of
-from .tables import figures_of, tables_of
-from .task_world import task_world
+from .runner import Runner, planning_world, runner_of
+from .tables import figures_of
 from .wording import advice, sentence, wilson
 from .work import control_budget
 
@@ -59,7 +55,7 @@ class _Request:
 
     model: Model
     """The model."""
-    task: ControlTask
+    task: AnyTask
     """The task."""
     solver: SolverName
     """Solver of the plans."""
@@ -81,7 +77,7 @@ class _Request:
     def inputs(self) -> dict[str, str]:
         """Return the SHA-256 of the files that are read, by name."""
         files = {} if self.model.root is None else {"model": self.model.root / "model.json"}
-        files |= {name: self.task.folder / name for name in self.task.plant.meshes}
+        files |= {name: self.task.folder / name for name in files_of(self.task)}
         return {name: sha256(path) for name, path in files.items() if path.is_file()}
 
 
@@ -130,7 +126,7 @@ def control(
         refuse_output(out, "run", overwrite)
     request = _Request(
         model=read_model(model),
-        task=read_task(Path(task)),
+        task=read_any_task(Path(task)),
         solver=solver,
         clock=clock,
         seeds=seeds,
@@ -143,18 +139,17 @@ def control(
         Checkpoint.remove_of(out, made_of)  # which a process left that was killed at its very end
         return kept
     refuse_output(out, "run", overwrite)
-    planning = task_world(request.model, request.task).planning()
+    planning = planning_world(request.model, request.task)
     with control_budget(planning, request.task, seeds, draws, out):
-        controller = Controller(request.model, request.task, solver, draws=draws, device=request.device)
-        plant = _plant(controller)
+        runner = runner_of(request.model, request.task, solver, draws, request.device)
         for seed in range(seeds):
-            plant.reset(*start_of(controller.task_world, seed))  # refuses what begins inside of something else
+            runner.reset(seed)  # refuses what begins inside of something else
         if clock == "real":
-            _require_speed(controller, plant)
+            _require_speed(runner, request.task)
         checkpoint = Checkpoint.beside(out, made_of, resume, overwrite, "a run")
         try:
-            runs = [_run(controller, plant, seed, clock, checkpoint) for seed in range(seeds)]
-            result = _write(out, request, controller, runs, (str(model), str(task)), overwrite)
+            runs = [_run(runner, seed, clock, checkpoint) for seed in range(seeds)]
+            result = _write(out, request, runner, runs, (str(model), str(task)), overwrite)
         except KeyboardInterrupt:
             raise InterruptedWork(f"{checkpoint.path} holds the runs that ended; --resume goes on with them.") from None
     checkpoint.remove()
@@ -168,29 +163,18 @@ def _kept(out: Path, request: _Request) -> ControlResult | None:
     return found if same and found.versions == versions() else None
 
 
-def _plant(controller: Controller) -> Plant:
-    found = controller.task_world
-    return MujocoPlant(found) if found.task.plant.kind == "mujoco" else ModelPlant(found)
-
-
-def _require_speed(controller: Controller, plant: Plant) -> None:
+def _require_speed(runner: Runner, task: AnyTask) -> None:
     """Check that a plan does not take much longer than a command.
 
     Raises:
         SlowPlansError: If it does, with the rate that is reached.
     """
-    truth = plant.reset(*start_of(controller.task_world, 0))
-    durations = []
+    truth, controller, durations = runner.reset(0), runner.controller, []
     for number in range(TRIALS):
-        state = ControlState(
-            time_s=number * controller.interval_s,
-            joints=dict(zip(("x", "y"), map(float, truth.finger_m), strict=True)),
-            position_m=truth.position_m,
-            quat_wxyz=truth.quat_wxyz,
-        )
+        state = truth.measured(number * controller.interval_s, truth.position_m, truth.quat_wxyz)
         plan = controller.plan(state, state.time_s + controller.interval_s)
         durations.append(math.inf if plan is None else plan.wall_s)
-    taken, task = float(np.median(durations[TRIALS // 2 :])), controller.task
+    taken = float(np.median(durations[TRIALS // 2 :]))
     if taken > SLOWEST * controller.interval_s:
         reason = f" Predictions run in the slow engine: {controller.slow}." if controller.slow else ""
         raise SlowPlansError(
@@ -201,34 +185,35 @@ def _require_speed(controller: Controller, plant: Plant) -> None:
         )
 
 
-def _run(controller: Controller, plant: Plant, seed: int, clock: ClockName, checkpoint: Checkpoint) -> PageRun:
+def _run(runner: Runner, seed: int, clock: ClockName, checkpoint: Checkpoint) -> PageRun:
     """Return a run from its checkpoint; it is made first if there is none."""
     slot = checkpoint.slot(f"seed {seed}")
     kept = slot.read(torch.device("cpu"))
     if kept is None:
         note(f"control: seed {seed}")
-        recording = run(controller, plant, seed, clock)
-        tables = tables_of(recording, controller.task, clock == "real")
-        figures = figures_of(recording, tables, _start_errors(controller, seed), controller.interval_s)
+        recording = runner.run(seed, clock)
+        tables = runner.tables(recording, clock == "real")
+        figures = figures_of(recording, tables, runner.start_errors(seed), runner.controller.interval_s)
         arrays = {name: torch.as_tensor(values) for name, values in tables.arrays.items()}
-        kept = {"figures": figures.model_dump_json(), "ended": recording.ended, "arrays": arrays}
+        kept = {
+            "figures": figures.model_dump_json(),
+            "ended": recording.ended,
+            "arrays": arrays,
+            "robot": tables.robot,
+            "joints": list(tables.joints),
+        }
         slot.write(kept)
     figures = ControlRun.model_validate_json(kept["figures"])
     arrays = {name: values.numpy() for name, values in kept["arrays"].items()}
-    return PageRun(figures=figures, tables=RunTables(seed=seed, ended=kept["ended"], arrays=arrays))
-
-
-def _start_errors(controller: Controller, seed: int) -> tuple[float, float]:
-    place, turn, _ = start_of(controller.task_world, seed)
-    position, quat = controller.task_world.pose(place, turn)
-    x, y, angle = controller.task_world.goal.errors(torch.as_tensor(position), torch.as_tensor(quat)).tolist()
-    return math.hypot(x, y), abs(math.degrees(angle))
+    names = tuple(kept["joints"])
+    tables = RunTables(seed=seed, ended=kept["ended"], arrays=arrays, robot=kept["robot"], joints=names)
+    return PageRun(figures=figures, tables=tables)
 
 
 def _write(
     out: Path,
     request: _Request,
-    controller: Controller,
+    runner: Runner,
     runs: list[PageRun],
     names: tuple[str, str],
     overwrite: bool,
@@ -237,10 +222,10 @@ def _write(
     with new_directory(out, "run", overwrite) as folder:
         creator = f"cgwm {versions()['cgwm']}"
         write_runs(folder / RECORDING, [one.tables for one in runs], task_toml(request.task), creator)
-        film, sheet = film_of(controller.task_world, runs[0].tables, request.device)
+        film, sheet = runner.film(runs[0].tables, request.device)
         if film is not None:
             (folder / FILM).write_bytes(film)
-        result = _result(request, controller, runs, names, folder / RECORDING, None if film is None else FILM)
+        result = _result(request, runner, runs, names, folder / RECORDING, None if film is None else FILM)
         page = control_html(result, request.task, runs, film, sheet)
         (folder / PAGE).write_text(page, encoding="utf-8")
         (folder / DOCUMENT).write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
@@ -249,7 +234,7 @@ def _write(
 
 def _result(
     request: _Request,
-    controller: Controller,
+    runner: Runner,
     runs: Iterable[PageRun],
     names: tuple[str, str],
     recording: Path,
@@ -259,11 +244,11 @@ def _result(
     good = [one for one in figures if one.ended == "success"]
     taken = float(np.median([one.plan_ms for one in figures])) / 1e3
     late = sum(one.late_plans for one in figures)
-    warnings = [f"predictions run in the slow engine: {controller.slow}."] if controller.slow else []
+    warnings = [f"predictions run in the slow engine: {runner.controller.slow}."] if runner.controller.slow else []
     return ControlResult(
         model=names[0],
         task=names[1],
-        object=controller.task_world.world.body_names[controller.task_world.object],
+        object=runner.object_name,
         solver=request.solver,
         clock=request.clock,
         plant=request.task.plant.kind,
@@ -273,6 +258,7 @@ def _result(
         reached_hz=1 / taken if taken > 0 else 0.0,
         sentence=sentence(figures, request.task, request.clock),
         advice=advice(request.task, taken) if late else "",
+        goals=sum(one.goals for one in figures),
         successes=len(good),
         success_rate=len(good) / len(figures),
         success_interval_95=wilson(len(good), len(figures)),

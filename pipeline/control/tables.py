@@ -19,13 +19,9 @@ def tables_of(recording: Recording, task: ControlTask, timed: bool) -> RunTables
         timed: Whether the durations of plans are kept; without them equal runs are equal to the byte.
     """
     rows = len(recording.commands.get("time_s", ()))
-    knots = task.planner.knots
 
     def commands(name: str, *tail: int) -> Array:
         return np.asarray(recording.commands.get(name, ()), float).reshape(rows, *tail)
-
-    def plans(name: str, *tail: int) -> Array:
-        return np.asarray(recording.plans.get(name, ()), float).reshape(-1, *tail)
 
     time, finger = commands("time_s"), commands("finger_m", 2)
     pose = np.concatenate((commands("position_m", 3), commands("quat_wxyz", 4)), -1)
@@ -47,6 +43,25 @@ def tables_of(recording: Recording, task: ControlTask, timed: bool) -> RunTables
         "control/position_error": errors[0],
         "control/turn_error": errors[1],
         "control/force": commands("force_n", 3),
+        **plan_arrays(recording, task.planner.knots, 2, timed),
+    }
+    return RunTables(seed=recording.seed, ended=recording.ended, arrays=arrays)
+
+
+def plan_arrays(recording: Recording, knots: int, joints: int, timed: bool) -> dict[str, np.ndarray]:
+    """Return the plans of a recording as arrays.
+
+    Args:
+        recording: The recording.
+        knots: Number of pieces of a plan.
+        joints: Number of joints.
+        timed: Whether the durations are kept.
+    """
+
+    def plans(name: str, *tail: int) -> Array:
+        return np.asarray(recording.plans.get(name, ()), float).reshape(-1, *tail)
+
+    return {
         "plans/state_time": plans("state_s"),
         "plans/acts_time": plans("acts_s"),
         "plans/wall": plans("wall_s") * timed,
@@ -54,10 +69,9 @@ def tables_of(recording: Recording, task: ControlTask, timed: bool) -> RunTables
         "plans/late": plans("late").astype(np.uint8),
         "plans/cost": plans("cost"),
         "plans/times": plans("times_s", knots),
-        "plans/targets": plans("targets_m", knots, 2),
+        "plans/targets": plans("targets_m", knots, joints),
         "plans/object": np.concatenate((plans("position_m", knots, 3), plans("quat_wxyz", knots, 4)), -1),
     }
-    return RunTables(seed=recording.seed, ended=recording.ended, arrays=arrays)
 
 
 def figures_of(recording: Recording, tables: RunTables, start: tuple[float, float], interval_s: float) -> ControlRun:
@@ -73,7 +87,7 @@ def figures_of(recording: Recording, tables: RunTables, start: tuple[float, floa
     wall, cpu = (1e3 * recording.column(name, "plans") for name in ("wall_s", "cpu_s"))
     errors = (arrays["control/position_error"], arrays["control/turn_error"])
     last = tuple(float(values[-1]) if len(values) else first for values, first in zip(errors, start, strict=True))
-    force = np.linalg.norm(arrays["control/force"], axis=-1)
+    force = np.linalg.norm(arrays.get("control/force", np.zeros((0, 3))), axis=-1)
     return ControlRun(
         seed=recording.seed,
         ended=recording.ended,
@@ -82,6 +96,7 @@ def figures_of(recording: Recording, tables: RunTables, start: tuple[float, floa
         turn_error_deg=last[1],
         start_position_error_m=start[0],
         start_turn_error_deg=start[1],
+        goals=recording.goals,
         commands=len(arrays["actions"]),
         plans=len(wall),
         late_plans=recording.late,

@@ -130,8 +130,9 @@ def task_world(model: Model, task: ControlTask) -> TaskWorld:
             has no such object; if the goal is out of reach or within a fixed body; or if the finger cannot touch the
             object.
     """
-    _require_model(model)
-    name = _object(model.file, task)
+    require_rigid(model)
+    require_metric(model)
+    name = free_object(model.file, task.object, task.source)
     file, collision = _with_finger(model, task, name)
     reduced = replace(model, file=file, collision=collision)
     world = World.from_model(reduced)
@@ -157,9 +158,22 @@ def task_world(model: Model, task: ControlTask) -> TaskWorld:
     return found
 
 
-def _require_model(model: Model) -> None:
-    instead = "the finger pushes a rigid body; the Python API's ClosedLoop steps jointed ones (docs/python-api.md)"
+def require_rigid(model: Model) -> None:
+    """Check that a model has no jointed bodies.
+
+    Raises:
+        InputDataError: If it has some.
+    """
+    instead = "the object is one rigid body; the Python API's ClosedLoop steps jointed ones (docs/python-api.md)"
     refuse_joints(model.file.articulations, model.place, "control", instead)
+
+
+def require_metric(model: Model) -> None:
+    """Check that a model has a scale.
+
+    Raises:
+        InputDataError: If it has none.
+    """
     if model.cameras is not None and model.cameras.scale.kind == "unscaled":
         raise InputDataError(
             f"{model.place}: the model has no scale: its cameras are unscaled.",
@@ -168,19 +182,27 @@ def _require_model(model: Model) -> None:
         )
 
 
-def _object(file: ModelFile, task: ControlTask) -> str:
-    """Return the name of the object, the only free body of a model."""
+def free_object(file: ModelFile, wanted: str | None, source: str) -> str:
+    """Return the name of the object, the only free body of a model.
+
+    Args:
+        file: The model.
+        wanted: The name that a task gives.
+        source: The task, for messages.
+
+    Raises:
+        InputDataError: If the model has no such body, or not one alone.
+    """
     free = [body.name for body in file.bodies if body.motion == "free"]
-    wanted = task.object
     if wanted is not None and wanted not in free:
         raise InputDataError(
-            f"{task.source}: object = '{wanted}' is no free body of the model.",
+            f"{source}: object = '{wanted}' is no free body of the model.",
             f"{', '.join(free) or 'none, the model has no free body'}.{did_you_mean(wanted, free)}",
             "correct the name.",
         )
     if len(free) != 1:
         raise InputDataError(
-            f"{task.source}: the model has {len(free)} free bodies{': ' * bool(free)}{', '.join(free)}.",
+            f"{source}: the model has {len(free)} free bodies{': ' * bool(free)}{', '.join(free)}.",
             "one: the object; where others go is not predicted.",
             "fit a capture of the object alone.",
         )

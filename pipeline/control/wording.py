@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ...schemas import ClockName, ControlRun, ControlTask
+from ...schemas import AnyTask, ClockName, ControlRun, HandTask
 
 _Z = 1.959964
 _ENDS = {
     "timeout": "ran out of time",
     "bad_states": "lost the state",
     "diverged": "diverged",
+    "dropped": "dropped the object",
 }
 
 
@@ -27,14 +28,24 @@ def wilson(count: int, total: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def sentence(runs: Sequence[ControlRun], task: ControlTask, clock: ClockName) -> str:
+def sentence(runs: Sequence[ControlRun], task: AnyTask, clock: ClockName) -> str:
     """Return the outcome of runs in words."""
     good = [run for run in runs if run.ended == "success"]
-    bars = f"{1e3 * task.success.position_m:g} mm and {task.success.turn_deg:g} deg"
-    words = [f"{len(good)} of {len(runs)} runs reached the goal within {bars}"]
+    place = task.success.position_m
+    bars = (
+        f"{task.success.turn_deg:g} deg" if place is None else f"{1e3 * place:g} mm and {task.success.turn_deg:g} deg"
+    )
+    what = "the goal"
+    if isinstance(task, HandTask) and task.success.goals > 1:
+        what = f"{task.success.goals} goals in a row"
+    words = [f"{len(good)} of {len(runs)} runs reached {what} within {bars}"]
     if good:
         times = sorted(run.time_s for run in good)
         words[0] += f", after {times[len(times) // 2]:.1f} s (median)"
+    if isinstance(task, HandTask) and task.success.goals > 1:
+        minutes = sum(run.time_s for run in runs) / 60
+        goals = sum(run.goals for run in runs)
+        words.append(f"{goals} goals in {minutes:.1f} minutes")
     for kind, text in _ENDS.items():
         count = sum(run.ended == kind for run in runs)
         words += [f"{count} {text}"] if count else []
@@ -43,7 +54,7 @@ def sentence(runs: Sequence[ControlRun], task: ControlTask, clock: ClockName) ->
     return "; ".join([*words, timed]) + "."
 
 
-def advice(task: ControlTask, taken_s: float) -> str:
+def advice(task: AnyTask, taken_s: float) -> str:
     """Return what would make the rate of a task hold where a plan takes `taken_s` [s]; empty where it holds."""
     interval = 1 / task.planner.control_hz
     if taken_s <= interval:

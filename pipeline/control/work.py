@@ -6,7 +6,7 @@ import math
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from ...schemas import ControlTask
+from ...schemas import AnyTask
 from ..physics.rollout_cost import rollout_seconds
 from ..physics.world import World
 from ..runtime.work_budget import Part, duration, within_budget
@@ -20,7 +20,7 @@ _PLAN_BYTES = 9 * 8
 """Of a plan, by piece, in the recording [bytes]."""
 
 
-def control_budget(world: World, task: ControlTask, seeds: int, draws: int, out: Path) -> AbstractContextManager[None]:
+def control_budget(world: World, task: AnyTask, seeds: int, draws: int, out: Path) -> AbstractContextManager[None]:
     """Return the check of the work of runs, see :func:`within_budget`.
 
     Args:

@@ -42,7 +42,7 @@ def link_spheres(articulation: Articulation, max_spheres: int) -> dict[str, Sphe
             f"{articulation.path}: {max_spheres} spheres for {len(solid)} links.",
             f"{LEAST_SPHERES * len(solid)} or more: {LEAST_SPHERES} a link.",
         )
-    meshes = {link.name: [_mesh_of(part) for part in link.geometry] for link in solid}
+    meshes = {link.name: [mesh_of_part(part) for part in link.geometry] for link in solid}
     areas = {name: sum(_area(mesh) for mesh in parts) for name, parts in meshes.items()}
     left, total = max_spheres - LEAST_SPHERES * len(solid), sum(areas.values())
     made: dict[bytes, Spheres] = {}
@@ -74,7 +74,7 @@ def _spheres_of(path: Path, name: str, parts: Sequence[GeometryOfLink], mesh: Me
 
 def link_mesh(link: LinkOfRobot) -> Mesh:
     """Return the surface of all that collides of a link, in its frame."""
-    return _joined([_mesh_of(part) for part in link.geometry])
+    return _joined([mesh_of_part(part) for part in link.geometry])
 
 
 def _area(mesh: Mesh) -> float:
@@ -88,7 +88,7 @@ def _joined(meshes: Sequence[Mesh]) -> Mesh:
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
-def _mesh_of(part: GeometryOfLink) -> Mesh:
+def mesh_of_part(part: GeometryOfLink) -> Mesh:
     """Return the surface of a part in the link's frame."""
     mesh = part.mesh if part.mesh is not None else _hull(_points_of(part))
     return Mesh(mesh.vertices @ part.rotation.T + part.position_m, mesh.faces)

@@ -10,10 +10,13 @@ import numpy as np
 from ...datasets.io.atomic import sha256
 from ...datasets.rollouts.control_file import RunTables, read_runs
 from ...schemas import (
+    HAND_FORMAT,
     JOINTS,
+    AnyTask,
     ControlResult,
     ControlRun,
     ControlTask,
+    HandTask,
     InputDataError,
     ValidationReport,
     parse,
@@ -63,7 +66,8 @@ def validate_run(path: Path) -> ValidationReport:
 def _recording_faults(path: Path, file: ControlResult, document: Path) -> Iterator[str]:
     """Yield what is wrong with the recording."""
     asked = parse_json(file.settings.get("task", ""), document)
-    task = parse(asked, ControlTask, f"{document}, settings.task")
+    hand = str(asked.get("format", "")) == HAND_FORMAT
+    task = parse(asked, HandTask if hand else ControlTask, f"{document}, settings.task")
     runs = read_runs(path)
     if [run.seed for run in runs] != [run.seed for run in file.runs]:
         yield f"{path.name} holds other seeds than control.json."
@@ -72,7 +76,7 @@ def _recording_faults(path: Path, file: ControlResult, document: Path) -> Iterat
         yield from (f"{path.name}, demo_{run.seed}: {fault}" for fault in _run_faults(run, figures, task))
 
 
-def _run_faults(run: RunTables, figures: ControlRun, task: ControlTask) -> Iterator[str]:
+def _run_faults(run: RunTables, figures: ControlRun, task: AnyTask) -> Iterator[str]:
     """Yield what is wrong with one run."""
     arrays = run.arrays
     wrong = [name for name, values in arrays.items() if not np.isfinite(values).all()]
@@ -83,15 +87,10 @@ def _run_faults(run: RunTables, figures: ControlRun, task: ControlTask) -> Itera
         yield "it ended otherwise, or has another number of commands, than control.json says."
     if len(arrays["plans/cost"]) != figures.plans:
         yield "it has another number of plans than control.json says."
-    for index, name in enumerate(JOINTS):
-        low, high = task.limits.joints[name]
-        target = arrays["control/target"][:, index]
-        slack = ROUNDING * max(abs(low), abs(high))
-        if len(target) and (target.min() < low - slack or target.max() > high + slack):
-            yield f"a target of joint '{name}' exceeds its limits."
-        fastest = np.abs(np.diff(target)).max(initial=0.0) * task.planner.control_hz
-        if fastest > task.limits.speed_m_s * (1 + 1e-6):
-            yield f"joint '{name}' was to move at {fastest:.4g} m/s, faster than its limit."
+    if (run.robot == "hand") != isinstance(task, HandTask):
+        yield "it is a run of another robot than that of the task."
+        return
+    yield from _hand_faults(run, figures, task) if isinstance(task, HandTask) else _finger_faults(run, task)
     for name in ("obs/object", "next_obs/object"):
         norm = np.linalg.norm(arrays[name][:, 3:], axis=-1)
         if np.abs(norm - 1).max(initial=0.0) > 1e-3:
@@ -99,3 +98,25 @@ def _run_faults(run: RunTables, figures: ControlRun, task: ControlTask) -> Itera
     ends = arrays["control/position_error"]
     if len(ends) and abs(float(ends[-1]) - figures.position_error_m) > ROUNDING + 1e-6 * figures.position_error_m:
         yield "its last position error is not that of control.json."
+
+
+def _finger_faults(run: RunTables, task: ControlTask) -> Iterator[str]:
+    """Yield which targets of a finger exceed its limits."""
+    for index, name in enumerate(JOINTS):
+        low, high = task.limits.joints[name]
+        target = run.arrays["control/target"][:, index]
+        slack = ROUNDING * max(abs(low), abs(high))
+        if len(target) and (target.min() < low - slack or target.max() > high + slack):
+            yield f"a target of joint '{name}' exceeds its limits."
+        fastest = np.abs(np.diff(target)).max(initial=0.0) * task.planner.control_hz
+        if fastest > task.limits.speed_m_s * (1 + 1e-6):
+            yield f"joint '{name}' was to move at {fastest:.4g} m/s, faster than its limit."
+
+
+def _hand_faults(run: RunTables, figures: ControlRun, task: HandTask) -> Iterator[str]:
+    """Yield what is wrong with a run of a hand; the ranges of its joints are in the file of the hand."""
+    fastest = np.abs(np.diff(run.arrays["control/target"], axis=0)).max(initial=0.0) * task.planner.control_hz
+    if fastest > task.limits.speed_rad_s * (1 + 1e-6):
+        yield f"a joint was to move at {fastest:.4g} rad/s, faster than its limit."
+    if int(run.arrays["control/reached"].sum()) != figures.goals:
+        yield "it reached another number of goals than control.json says."

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from cgwm.cli.app import app
 from cgwm.datasets.models.model import write_model
-from cgwm.pipeline.control import stage
+from cgwm.pipeline.control import runner, stage
 from cgwm.pipeline.control.wording import advice, wilson
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import TASKS, ControlResult, InputDataError, UsageError, task_toml
@@ -68,14 +68,14 @@ def test_robomimic_finds_what_it_reads(done: Path) -> None:
 
 
 def test_a_killed_run_goes_on_where_it_was(done: Path, inputs: tuple[Path, Path], monkeypatch) -> None:
-    out, made = inputs[0].parent / "again", stage.run
+    out, made = inputs[0].parent / "again", runner.run
 
     def killed(controller, plant, seed, clock):
         if seed == 1:
             raise KeyboardInterrupt
         return made(controller, plant, seed, clock)
 
-    monkeypatch.setattr(stage, "run", killed)
+    monkeypatch.setattr(runner, "run", killed)
     with pytest.raises(KeyboardInterrupt) as caught:
         stage.control(*inputs, out, clock="ideal", seeds=2)
     assert str(caught.value) == f"{out}.checkpoint holds the runs that ended; --resume goes on with them."
@@ -84,7 +84,7 @@ def test_a_killed_run_goes_on_where_it_was(done: Path, inputs: tuple[Path, Path]
     with pytest.raises(UsageError, match="was made with other solver"):
         stage.control(*inputs, out, solver="both", clock="ideal", seeds=2, resume=True)
     seeds = []
-    monkeypatch.setattr(stage, "run", lambda *given: seeds.append(given[2]) or made(*given))
+    monkeypatch.setattr(runner, "run", lambda *given: seeds.append(given[2]) or made(*given))
     stage.control(*inputs, out, clock="ideal", seeds=2, resume=True)
     assert seeds == [1]
     assert (out / "run.h5").read_bytes() == (done / "run.h5").read_bytes()

@@ -111,7 +111,7 @@ def test_the_ideal_clock_lets_a_plan_act_at_once() -> None:
 
 def test_measured_states_are_late_and_noisy_as_asked() -> None:
     task = push_task(plant={"delay_s": 2 * DT, "noise_m": 0.003, "noise_deg": 3.0})
-    sensor = Sensor(Controller(pushed_model(), task), 0)
+    sensor = Sensor(task.plant, DT, 0)
     still = Truth(position_m=np.zeros(3), quat_wxyz=np.array([1.0, 0, 0, 0]), velocity_m_s=np.zeros(3),
                   omega_body_rad_s=np.zeros(3), finger_m=np.zeros(2), force_n=np.zeros(3))  # fmt: skip
     seen = [sensor.seen(DT * k, still) for k in range(600)]

@@ -9,7 +9,7 @@ import pytest
 import torch
 from cgwm.pipeline.control.controller import Controller, ControlState
 from cgwm.pipeline.control.horizon import Horizon, Targets
-from cgwm.pipeline.control.solvers import solver_of
+from cgwm.pipeline.control.solvers import Mppi, solver_of
 from helpers import fused_host
 from helpers.pushing import RADIUS, push_task, pushed_model
 from helpers.small_model import HALF
@@ -55,7 +55,7 @@ def test_one_degree_of_freedom_is_solved_to_its_known_optimum(name, bound: float
     lowest = float(problem.costs(torch.full((1, 10, 1), problem.best, dtype=torch.float64)))
     plan = torch.zeros(10, 1, dtype=torch.float64)
     for _ in range(12):  # plans follow each other, each warm-started by the one before
-        found = solver_of(name, 64).solve(problem, plan, nothing, rng)
+        found = solver_of(name, Mppi(64)).solve(problem, plan, nothing, rng)
         assert found.cost <= float(problem.costs(plan[None])) + 1e-12  # never worse than the plan before
         assert found.values.abs().max() <= bound
         plan = found.values

@@ -1,0 +1,198 @@
+"""A LEAP hand turns a cube to random orientations: the controller of cgwm on the scene of judo-rai.
+
+python benchmarks/hand.py run --scene FOLDER [--seeds 5] [--clock ideal|real|cpu] [--contenders mppi,both,hold]
+python benchmarks/hand.py table
+
+FOLDER is `judo/models` of the wheel of judo-rai 0.1.0 (MIT; `pip download --no-deps judo-rai==0.1.0`), with the meshes
+of google-deepmind/mujoco_menagerie's leap_hand, of which only `tip` and `thumb_tip` collide. The plant is its scene
+`xml/leap_cube_sim.xml` as it is; the planner's hand is made from the file of the hand alone, which is cut out of that
+scene. A goal counts within 0.4 rad; a run ends at a drop, after 80 s without a goal, or at its length. Clocks: real
+charges each plan its wall time, cpu the time of all processors (what one idle core would need), ideal nothing. `hold`
+never moves: what the goals give by chance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from cgwm.datasets.models.model import Model
+from cgwm.datasets.shapes.ply import Splats
+from cgwm.pipeline.control.hand_controller import HandController
+from cgwm.pipeline.control.hand_loop import run_hand
+from cgwm.pipeline.control.hand_plant import HandScenePlant
+from cgwm.pipeline.control.planning import ControlPlan, ControlState
+from cgwm.pipeline.control.solvers import Solution
+from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, Pose, Provenance
+from store import Store
+
+HALF_M, MASS_KG, ROUNDING_M = 0.03, 0.108, 0.004
+FRICTION, TIP_FRICTION = 0.2, 0.7
+HOME = {
+    "if_mcp": 0.5, "if_rot": -0.75, "if_pip": 0.75, "if_dip": 0.25, "mf_mcp": 0.5, "mf_rot": 0.0, "mf_pip": 0.75,
+    "mf_dip": 0.25, "rf_mcp": 0.5, "rf_rot": 0.75, "rf_pip": 0.75, "rf_dip": 0.25, "th_cmc": 0.65, "th_axl": 0.9,
+    "th_mcp": 0.75, "th_ipl": 0.6,
+}  # fmt: skip
+PLACE_M, ROOT_WXYZ = (0.0, 0.03, 0.1), (0.0, 0.9961947, 0.0, -0.0871557)
+
+
+def cube() -> Model:
+    """Return the model of the cube, with the numbers of the scene."""
+    inner = HALF_M - ROUNDING_M
+    corners = np.array([(x, y, z) for x in (-inner, inner) for y in (-inner, inner) for z in (-inner, inner)])
+    moment = MASS_KG * 2 / 3 * HALF_M**2
+    body = BodyModel(
+        name="object", motion="free", mass_kg=MASS_KG, inertia_kg_m2=(moment, moment, moment, 0.0, 0.0, 0.0),
+        com_m=(0.0, 0.0, 0.0), photo_pose=Pose(position_m=PLACE_M, quat_wxyz=(1.0, 0.0, 0.0, 0.0)), convex=True,
+    )  # fmt: skip
+    contact = ContactParameters(friction=FRICTION, contact_time_s=0.004, damping_ratio=1.0)
+    file = ModelFile(bodies=(body,), contact=contact, provenance=Provenance(capture="none"))
+    spheres = Splats(corners, np.full(8, ROUNDING_M / 2), np.full(8, 0.95), np.full((8, 3), 0.5))
+    return Model(root=None, file=file, collision={"object": spheres})
+
+
+def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
+    """Return the task; the scene's files are copied into the folder, with the hand alone beside them."""
+    shutil.copytree(scene, folder, dirs_exist_ok=True)
+    xml = folder / "xml"
+    for path in xml.rglob("*.xml"):
+        text = path.read_text(encoding="utf-8").replace('"../../../meshes/leap/"', f'"{folder}/meshes/leap/"')
+        path.write_text(text.replace("../../meshes/leap/", ""), encoding="utf-8")
+    parts = xml / "leap_components"
+    alone = "\n".join(
+        line for line in (parts / "params_and_default.xml").read_text().splitlines() if "trace_cube" not in line
+    )
+    (parts / "params_hand.xml").write_text(alone)
+    (xml / "hand.xml").write_text(
+        '<mujoco model="leap_rh"><include file="leap_components/assets.xml"/>'
+        '<include file="leap_components/params_hand.xml"/><worldbody><body name="leap_hand">'
+        '<include file="leap_components/leap_hand.xml"/></body></worldbody></mujoco>'
+    )
+    tips = {f"{finger}_ds": TIP_FRICTION for finger in ("if", "mf", "rf", "th")}
+    task = HandTask.model_validate(
+        {
+            "robot": {"file": "xml/hand.xml", "quat_wxyz": ROOT_WXYZ, "friction": tips},
+            "start": {"position_m": PLACE_M, "joints": HOME},
+            "goal": {"turn_deg": 23.0},
+            "planner": {
+                "control_hz": given.hz,
+                "samples": given.samples,
+                "horizon_s": given.horizon,
+                "step_s": given.step,
+            },
+            "success": {"turn_deg": math.degrees(0.4), "drop_m": 0.4, "goals": 1000, "timeout_s": given.seconds},
+            "plant": {"kind": "mujoco", "scene": "xml/leap_cube_sim.xml", "body": "cube"},
+        }
+    )
+    task._source = str(folder / "task.toml")
+    return task
+
+
+class Hold:
+    """Targets that stay."""
+
+    def solve(self, objective: Any, warm: torch.Tensor, propose: Any, rng: np.random.Generator) -> Solution:
+        """See `cgwm.pipeline.control.solvers.Solver`."""
+        return Solution(torch.zeros_like(warm), 0.0)
+
+
+def measure(name: str, task: HandTask, seed: int, clock: str) -> dict[str, Any]:
+    """Return the figures of one run."""
+    controller = HandController(cube(), task, "mppi" if name == "hold" else name)  # pyright: ignore[reportArgumentType]
+    if name == "hold":
+        controller._solver = Hold()
+    if clock == "cpu":
+        _charge_processors(controller)
+    before = os.getloadavg()[0]
+    found = run_hand(controller, HandScenePlant(controller.hand), seed, "ideal" if clock == "ideal" else "real")
+    wall, cpu = (1e3 * found.column(key, "plans") for key in ("wall_s", "cpu_s"))
+    reached = found.column("reached")
+    return {
+        "ended": found.ended,
+        "time_s": round(len(reached) * controller.interval_s, 2),
+        "goals": found.goals,
+        "first_s": round(float(np.flatnonzero(reached)[0] + 1) * controller.interval_s, 2) if found.goals else None,
+        "turn_deg": round(float(np.median(found.column("turn_error_deg"))), 1),
+        "position_mm": round(1e3 * float(np.median(found.column("position_error_m"))), 1),
+        "plans": len(wall),
+        "late": found.late,
+        "plan_ms": round(float(np.median(wall)), 1),
+        "plan_cpu_ms": round(float(np.median(cpu)), 1),
+        "load": round(0.5 * (before + os.getloadavg()[0]), 1),
+    }
+
+
+def _charge_processors(controller: HandController) -> None:
+    """Let plans take the time of all processors in place of the wall time, which other processes lengthen."""
+    made = type(controller).plan
+
+    def plan(state: ControlState | None, acts_s: float | None = None) -> ControlPlan | None:
+        found = made(controller, state, acts_s)
+        return None if found is None else replace(found, wall_s=found.cpu_s)
+
+    controller.plan = plan
+
+
+def rows(store: Store) -> Iterator[list[str]]:
+    """Yield the rows of the table."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in store.results():
+        found.setdefault(row["key"].rpartition("/")[0], []).append(row)
+    for name, runs in sorted(found.items()):
+        minutes = sum(run["time_s"] for run in runs) / 60
+        goals = [run["goals"] for run in runs]
+        yield [name, str(len(runs)), f"{sum(goals)} in {minutes:.1f} min", f"{sum(goals) / minutes:.1f}",
+               f"{np.median(goals):.0f}", str(sum(run["ended"] == "dropped" for run in runs)),
+               f"{np.median([run['plan_cpu_ms'] for run in runs]):.0f}",
+               f"{100 * sum(run['late'] for run in runs) / sum(run['plans'] for run in runs):.0f}"]  # fmt: skip
+
+
+HEADER = ("contender, clock, rate", "runs", "goals", "goals a minute", "goals a run (median)", "drops", "plan, CPU ms",
+          "late, %")  # fmt: skip
+
+
+def main() -> None:
+    """Measure what is asked for and is not there yet, or print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", choices=("run", "table"))
+    parser.add_argument("--scene", type=Path, help="judo/models of judo-rai 0.1.0, with meshes/leap/")
+    parser.add_argument("--contenders", default="mppi")
+    parser.add_argument("--clock", choices=("real", "ideal", "cpu"), default="real")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of a run")
+    parser.add_argument("--hz", type=float, default=20.0)
+    parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--horizon", type=float, default=1.0)
+    parser.add_argument("--step", type=float, default=0.02)
+    parser.add_argument("--store", type=Path, default=None)
+    parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
+    given = parser.parse_args()
+    store = Store("hand", given.store, given.any_commit)
+    if given.work == "table":
+        print(" | ".join(HEADER))
+        for row in rows(store):
+            print(" | ".join(row))
+        return
+    if given.scene is None:
+        sys.exit("run needs --scene FOLDER, judo/models of the wheel of judo-rai 0.1.0.")
+    torch.set_num_threads(len(os.sched_getaffinity(0)))
+    with tempfile.TemporaryDirectory() as folder:
+        task = task_in(Path(folder), given.scene, given)
+        for seed in range(given.seeds):
+            for name in given.contenders.split(","):
+                key = f"{name}, {given.clock}, {given.hz:g} Hz, {given.samples} x {given.horizon:g} s/{seed}"
+                store.result(key, lambda n=name, s=seed: measure(n, task, s, given.clock))
+
+
+if __name__ == "__main__":
+    main()

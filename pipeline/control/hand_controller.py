@@ -1,0 +1,128 @@
+"""The controller of a hand: measured states in, targets of its joints out, without a simulator behind it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from ...datasets.models.model import Model, read_model
+from ...schemas import HandTask, SolverName, UsageError, read_hand_task
+from ..physics.world import World
+from ..runtime.device import resolve_device
+from .controller import drawn_worlds
+from .hand_objective import HandObjective
+from .hand_world import HandWorld, hand_world, world_of
+from .horizon import Targets
+from .planning import ControlState, PlanningController
+from .solvers import Mppi, solver_of
+
+NOISE = (0.05, 0.35)
+"""Smallest and largest standard deviation of changed plans, in units of a joint's span."""
+
+
+class HandController(PlanningController):
+    """A controller that turns an object in a hand to an orientation.
+
+    Args:
+        model: The fitted model of the object, or its directory.
+        task: The task, or its file.
+        solver: mppi, gauss-newton or both.
+        seed: Seed of everything random: equal seeds and states give equal commands on the CPU.
+        draws: Number of draws of the model's uncertainty that each plan is evaluated under; 0 for the estimate alone.
+        device: Device of the predictions: auto, cpu or cuda.
+
+    Attributes:
+        goal_wxyz: Orientation of the object that is wanted, body to world, shape (4,); set it by `aim`.
+
+    Raises:
+        InputDataError: If the model or the hand cannot serve the task, see `hand_world`.
+        UsageError: If the device is not there, or numbers are out of range.
+    """
+
+    def __init__(
+        self,
+        model: Model | Path | str,
+        task: HandTask | Path | str,
+        solver: SolverName = "mppi",
+        seed: int = 0,
+        draws: int = 0,
+        device: str = "cpu",
+    ) -> None:
+        model = model if isinstance(model, Model) else read_model(model)
+        task = task if isinstance(task, HandTask) else read_hand_task(Path(task))
+        if draws < 0:
+            raise UsageError(f"{draws} draws.", "0 or more.")
+        self.hand: HandWorld = hand_world(model, task)
+        self.task = task
+        self.goal_wxyz = np.array(task.start.quat_wxyz)
+        where, found = str(resolve_device(device)), self.hand
+
+        def planned(drawn: Model | None) -> World:
+            return found.planning(
+                None if drawn is None else world_of(drawn, task, found.chain, found.world.bodies[:-1])
+            )
+
+        worlds = drawn_worlds(model, draws, seed, where, planned)
+        sampling = Mppi(task.planner.samples, noise=NOISE, alike=1)
+        super().__init__(worlds, solver_of(solver, sampling), where, seed)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of targets."""
+        return self.hand.joints
+
+    @property
+    def interval_s(self) -> float:
+        """Length of a command [s]."""
+        return 1 / self.task.planner.control_hz
+
+    @property
+    def bad_states(self) -> int:
+        """Bad states in a row after which a run stops."""
+        return self.task.planner.bad_states
+
+    def limits(self, joint: str) -> tuple[float, float, float]:
+        """Return the smallest and the largest target of a joint [rad], and its largest speed [rad/s]."""
+        index = self.hand.joints.index(joint)
+        return float(self.hand.lower[index]), float(self.hand.upper[index]), self.task.limits.speed_rad_s
+
+    def aim(self, goal_wxyz: ArrayLike) -> None:
+        """Set the orientation that is wanted, body to world, shape (4,).
+
+        Raises:
+            UsageError: If it is no orientation.
+        """
+        goal = np.asarray(goal_wxyz, float)
+        if goal.shape != (4,) or not np.isfinite(goal).all() or not np.linalg.norm(goal) > 1e-9:
+            raise UsageError(f"a goal of {np.asarray(goal_wxyz).tolist()}.", "w, x, y, z of an orientation.")
+        self.goal_wxyz = goal / np.linalg.norm(goal)
+
+    def _objective(self, state: ControlState, acts_s: float) -> tuple[HandObjective, Tensor]:
+        """Return the objective of a plan, and the plan before over its knots, shape (N, joints)."""
+        planner, hand = self.task.planner, self.hand
+        measured = np.array([state.joints[name] for name in hand.joints])
+        before = (
+            self._plan.targets if self._plan else Targets(times_s=np.array([state.time_s]), values_m=measured[None])
+        )
+        lead = [state.time_s, acts_s] if acts_s > state.time_s + 1e-9 else [state.time_s]
+        knots = acts_s + planner.horizon_s / planner.knots * np.arange(1, planner.knots + 1)
+        zero = np.zeros(3)
+        objective = HandObjective(
+            hand=hand,
+            worlds=self._worlds,
+            state=hand.state(
+                state.position_m,
+                np.asarray(state.quat_wxyz, float) / np.linalg.norm(state.quat_wxyz),
+                dict(state.joints),
+                zero if state.velocity_m_s is None else state.velocity_m_s,
+                zero if state.omega_body_rad_s is None else state.omega_body_rad_s,
+                dict(state.joint_speeds or {}),
+            ),
+            goal_wxyz=self.goal_wxyz,
+            times_s=np.array([*lead, *knots]),
+            given_rad=before.at(np.array(lead)),
+        )
+        return objective, objective.values_of(before)

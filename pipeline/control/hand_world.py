@@ -1,0 +1,241 @@
+"""The world of a task for a hand: its links as convex shapes on joints with servos, and the object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from ...datasets.models.model import Model
+from ...datasets.robots import Articulation, read_articulation
+from ...schemas import HandTask, InputDataError, require_joints
+from ...schemas.materials import pair_of
+from ..physics.articulated import Servo, chain_of
+from ..physics.chain import Chain, Joint
+from ..physics.chain_state import with_joints
+from ..physics.checks import require_apart
+from ..physics.contact_law import ContactLaw
+from ..physics.hull import Hull
+from ..physics.paper_law import PaperLaw
+from ..physics.world import Body, State, World
+from ..sg_gs.link_hulls import Balls, link_hulls
+from .horizon import Array
+from .task_world import SOFTEST_STEPS, free_object, require_metric, require_rigid
+
+OBJECT, LINK = "the object", "a link"
+"""Materials of the object, and prefix of those of links with a friction of their own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandWorld:
+    """A task for a hand with the world that it is about."""
+
+    task: HandTask
+    """The task."""
+    model: Model
+    """The model of the object."""
+    world: World
+    """Links of the hand, then the object; batch 1, float64 on the CPU."""
+    joints: tuple[str, ...]
+    """Names of the joints, in the order of commands."""
+    lower: Array
+    """Smallest targets [rad], shape (joints,)."""
+    upper: Array
+    """Largest targets [rad], shape (joints,)."""
+    home: Array
+    """Values of the joints at the start [rad], shape (joints,)."""
+
+    @property
+    def object(self) -> int:
+        """Index of the object."""
+        return len(self.world.bodies) - 1
+
+    @property
+    def chain(self) -> Chain:
+        """The hand."""
+        return self.world.chains[0]
+
+    @property
+    def span(self) -> Array:
+        """Larger distance of each joint's limits from its value at the start [rad], shape (joints,)."""
+        return np.maximum(self.upper - self.home, self.home - self.lower)
+
+    def planning(self, world: World | None = None) -> World:
+        """Return a world for predictions in the steps of the planner, whose contacts are soft enough for these steps.
+
+        Args:
+            world: A world with other parameters; None for that of the model.
+        """
+        world, step = world or self.world, self.task.planner.step_s
+        laws = {pair: _soft(law, step) for pair, law in world.pair_laws.items()}
+        return replace(world, contact=_soft(world.contact, step), pair_laws=laws, step_s=step)
+
+    def state(
+        self,
+        position_m: ArrayLike,
+        quat_wxyz: ArrayLike,
+        joints: Mapping[str, float],
+        velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
+        omega_body_rad_s: ArrayLike = (0.0, 0.0, 0.0),
+        speeds: Mapping[str, float] | None = None,
+    ) -> State:
+        """Return the state (1, nb, ...) of all bodies from pose and velocities of the object and values of the joints.
+
+        Args:
+            position_m: Position of the object [m], shape (3,).
+            quat_wxyz: Its orientation, shape (4,).
+            joints: Values of the joints [rad].
+            velocity_m_s: Velocity of the object [m/s], shape (3,).
+            omega_body_rad_s: Its angular velocity [rad/s], shape (3,).
+            speeds: Speeds of the joints [rad/s]; 0 for those that are left out.
+        """
+        count = len(self.world.bodies)
+        position, velocity, omega = (torch.zeros(1, count, 3, dtype=torch.float64) for _ in range(3))
+        quat = torch.zeros(1, count, 4, dtype=torch.float64)
+        quat[..., 0] = 1.0
+        position[0, 0] = torch.tensor(self.task.robot.position_m, dtype=torch.float64)
+        quat[0, 0] = torch.tensor(self.task.robot.quat_wxyz, dtype=torch.float64)
+        for field, value in ((position, position_m), (quat, quat_wxyz), (velocity, velocity_m_s),
+                             (omega, omega_body_rad_s)):  # fmt: skip
+            field[0, -1] = torch.as_tensor(np.asarray(value, float))
+        return with_joints(self.world, State(position, quat, velocity, omega), joints, speeds)
+
+
+def hand_world(model: Model, task: HandTask) -> HandWorld:
+    """Return the world of a task for a hand.
+
+    Args:
+        model: A model with fitted physics, whose only free body is the object.
+        task: The task.
+
+    Raises:
+        InputDataError: If the model has no physics, no scale, joints or several free bodies; if the file is no hand, or
+            lacks a joint or a link that the task names; or if the object begins inside of the hand.
+    """
+    require_rigid(model)
+    require_metric(model)
+    free_object(model.file, task.object, task.source)
+    hand = read_articulation(task.folder / task.robot.file).welded()
+    moving = tuple(joint.name for joint in hand.joints)
+    wrong = require_joints(task, moving, tuple(link.name for link in hand.links))
+    if wrong:
+        raise InputDataError(f"{task.source}: {wrong}", todo="correct the name or the range.")
+    _require_servos(task, hand)
+    chain, links = chain_of(hand, {link.name: (np.zeros((0, 3)), np.zeros(0)) for link in hand.links}, "fixed",
+                            Servo(**task.servo.model_dump()))  # fmt: skip
+    chain, bodies = _shaped(task, chain, links, link_hulls(hand, task.robot.corners))
+    world = world_of(model, task, chain, bodies)
+    limits = [_limits(task, joint) for joint in chain.moving]
+    lower, upper = (np.array(side) for side in zip(*limits, strict=True))
+    home = np.array([task.start.joints.get(joint, min(max(0.0, low), high))
+                     for joint, (low, high) in zip(moving, limits, strict=True)])  # fmt: skip
+    outside = [k for k in range(len(moving)) if not lower[k] - 1e-9 <= home[k] <= upper[k] + 1e-9]
+    if outside:
+        k = outside[0]
+        raise InputDataError(
+            f"{task.source}: [start] joints: '{moving[k]}' = {home[k]:g} rad.",
+            f"{lower[k]:g} to {upper[k]:g} rad, its limits.",
+            "correct the value.",
+        )
+    found = HandWorld(task=task, model=model, world=world, joints=moving, lower=lower, upper=upper, home=home)
+    begun = found.state(task.start.position_m, task.start.quat_wxyz, dict(zip(moving, home.tolist(), strict=True)))
+    require_apart(world, begun, f"{task.source}, the start")
+    _require_room(found)
+    return found
+
+
+def _require_servos(task: HandTask, hand: Articulation) -> None:
+    without = [joint.name for joint in hand.joints if joint.stiffness <= 0]
+    if without and task.servo.stiffness is None:
+        raise InputDataError(
+            f"{task.source}: joint '{without[0]}' of {hand.path.name} has no servo.",
+            "a gain above 0 for every joint.",
+            "set [servo] stiffness and damping, or give the file position actuators.",
+        )
+
+
+def _require_room(found: HandWorld) -> None:
+    """Check that the object has room where it is wanted, with the hand as at the start."""
+    task = found.task
+    if task.goal.position_m is None:
+        return
+    joints = dict(zip(found.joints, found.home.tolist(), strict=True))
+    require_apart(
+        found.world, found.state(task.wanted_m, task.start.quat_wxyz, joints), f"{task.source}, [goal] position_m"
+    )
+
+
+def _limits(task: HandTask, joint: Joint) -> tuple[float, float]:
+    low, high = task.limits.joints.get(joint.name, (-math.inf, math.inf))
+    return max(low, float(joint.lower[0])), min(high, float(joint.upper[0]))
+
+
+def _shaped(
+    task: HandTask, chain: Chain, links: list[Body], shapes: Mapping[str, list[Balls]]
+) -> tuple[Chain, list[Body]]:
+    """Return the chain and its links with their shapes; further shapes of a link are links that are fixed to it."""
+    bodies, more, joints = [], [], []
+    for link in links:
+        first, *others = [_with_hull(link, balls) for balls in shapes[link.name]] or [link]
+        bodies.append(first)
+        for number, part in enumerate(others, 1):
+            name = f"{link.name}/{number}"
+            more.append(replace(part, name=name, mass=0 * link.mass, inertia=0 * link.inertia))
+            joints.append(Joint.of(f"{name}/fixed", "fixed", name, link.name))
+    every = [
+        replace(body, material=f"{LINK} {body.name}" if body.name in task.robot.friction else None)
+        for body in (*bodies, *more)
+    ]
+    return replace(chain, joints=(*chain.joints, *joints)), every
+
+
+def _with_hull(body: Body, balls: Balls) -> Body:
+    centers, radii = (torch.as_tensor(values)[None] for values in balls)
+    every = torch.arange(radii.shape[1])
+    return replace(body, centers=centers, radii=radii, on_plane=None, hull=Hull.of(centers[0], radii[0], every))
+
+
+def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body]) -> World:
+    """Return the world of hand and object, with the law of the model and the frictions that the task gives.
+
+    Args:
+        model: A model of the object.
+        task: The task.
+        chain: The hand.
+        links: Its links.
+
+    Raises:
+        InputDataError: If the model has another contact law than that of cgwm.
+    """
+    alone, name = World.from_model(model), free_object(model.file, task.object, task.source)
+    thing = alone.bodies[alone.body_names.index(name)]
+    law = alone.contact
+    if not isinstance(law, ContactLaw):
+        raise InputDataError(f"{model.place}: the model has the contact law of a paper.", "that of cgwm.", "fit again.")
+    laws = {
+        pair_of(OBJECT, f"{LINK} {link}"): replace(law, friction=torch.full_like(law.friction, value))
+        for link, value in task.robot.friction.items()
+    }
+    return World(
+        bodies=(*links, replace(thing, material=OBJECT)),
+        gravity=alone.gravity,
+        ground_normal=None,
+        ground_offset=None,
+        contact=law,
+        pair_laws=laws,
+        step_s=min(alone.step_s, task.planner.step_s),
+        chains=(chain,),
+        source=alone.source,
+    )
+
+
+def _soft(law: ContactLaw | PaperLaw, step_s: float) -> ContactLaw | PaperLaw:
+    if not isinstance(law, ContactLaw):
+        return law
+    time: Tensor = law.contact_time_s.clamp_min(SOFTEST_STEPS * step_s)
+    return replace(law, contact_time_s=time, damping_ratio=law.damping_ratio.clamp_min(1.0))

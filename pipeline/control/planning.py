@@ -1,0 +1,217 @@
+"""What controllers of all robots have in common: measured states in, plans and commands by joint name out."""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...schemas import JOINTS, NotConvergedError, UsageError
+from ..physics.fused.host import lacking
+from ..runtime.resources import one_torch_thread
+from .horizon import Array, Forecast, Targets
+from .objective import PlanObjective, Worlds
+from .solvers import Solver
+
+UNIT_TOLERANCE = 0.01
+"""Largest deviation of a measured quaternion's length from 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlState:
+    """A measured state."""
+
+    time_s: float
+    """Time at which it was measured [s]; a state that is not later than the one before is stale."""
+    joints: Mapping[str, float]
+    """Position of each joint by name [m, of hinges rad]."""
+    position_m: Array
+    """Origin of the object's frame, world frame [m], shape (3,)."""
+    quat_wxyz: Array
+    """Orientation of the object, body to world, shape (4,)."""
+    velocity_m_s: Array | None = None
+    """Velocity of that origin, world frame [m/s], shape (3,); None: at rest."""
+    omega_body_rad_s: Array | None = None
+    """Angular velocity, body frame [rad/s], shape (3,); None: at rest."""
+    joint_speeds: Mapping[str, float] | None = None
+    """Speed of each joint by name [m/s, of hinges rad/s]; None: at rest. A finger without servos has none."""
+
+    def fault(self, joints: Sequence[str] = JOINTS) -> str:
+        """Return what is wrong with the numbers of the state, in words; empty for nothing.
+
+        Args:
+            joints: Names of the robot's joints; by default the finger's.
+        """
+        for name, size in (("position_m", 3), ("quat_wxyz", 4), ("velocity_m_s", 3), ("omega_body_rad_s", 3)):
+            value = getattr(self, name)
+            if value is not None and (np.shape(value) != (size,) or not np.isfinite(value).all()):
+                return f"{name} is not {size} finite numbers"
+        if abs(np.linalg.norm(self.quat_wxyz) - 1) > UNIT_TOLERANCE:
+            return "quat_wxyz has not the length 1"
+        wrong = [name for name in joints if not math.isfinite(self.joints.get(name, math.nan))]
+        if wrong:
+            return f"joint '{wrong[0]}' has no finite position"
+        wrong = [name for name, value in (self.joint_speeds or {}).items() if not math.isfinite(value)]
+        if wrong:
+            return f"joint '{wrong[0]}' has no finite speed"
+        return "" if math.isfinite(self.time_s) else "time_s is not finite"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlPlan:
+    """Commands for the time to come, and what the model predicts of them."""
+
+    state_s: float
+    """Time of the state that it was made from [s]."""
+    acts_s: float
+    """Time from which it acts [s]; until then it has the targets of the plan before."""
+    targets: Targets
+    """Targets of the joints over the horizon."""
+    cost: float
+    """Cost of the plan."""
+    wall_s: float
+    """Wall time that it took [s]."""
+    cpu_s: float
+    """Time of all processors that it took [s]."""
+
+
+class PlanningController(ABC):
+    """A controller that makes a plan from each measured state.
+
+    Args:
+        worlds: The worlds of the predictions.
+        solver: The solver.
+        device: Device of the predictions.
+        seed: Seed of everything random.
+    """
+
+    def __init__(self, worlds: Worlds, solver: Solver, device: str, seed: int) -> None:
+        self.held = 0
+        """States until now that were missing, stale or no numbers."""
+        self._worlds, self._solver, self._device = worlds, solver, device
+        self.restart(seed)
+
+    @property
+    @abstractmethod
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of targets."""
+
+    @property
+    @abstractmethod
+    def interval_s(self) -> float:
+        """Length of a command [s]."""
+
+    @property
+    @abstractmethod
+    def bad_states(self) -> int:
+        """Bad states in a row after which a run stops."""
+
+    @abstractmethod
+    def limits(self, joint: str) -> tuple[float, float, float]:
+        """Return the smallest and the largest target of a joint [m, of hinges rad], and its largest speed."""
+
+    @abstractmethod
+    def _objective(self, state: ControlState, acts_s: float) -> tuple[PlanObjective, Tensor]:
+        """Return the objective of a plan, and the plan before over its pieces, shape (N, joints)."""
+
+    def restart(self, seed: int) -> None:
+        """Forget all plans and states, and begin with another seed."""
+        self._rng = np.random.default_rng([seed, 1])
+        self._plan: ControlPlan | None = None
+        self._found: tuple[PlanObjective, Tensor] | None = None
+        self._command: dict[str, float] = {}
+        self._last_s, self._bad, self.held = -math.inf, 0, 0
+
+    @property
+    def lost(self) -> bool:
+        """Whether so many states in a row were bad that a run has to stop."""
+        return self._bad >= self.bad_states
+
+    @property
+    def slow(self) -> str:
+        """Why predictions run in the slow engine, in words; empty where they do not."""
+        world = self._worlds.batch((0,) if self._worlds.draws > 1 else ())
+        return "" if self._device != "cpu" else lacking(world) or ""
+
+    def command(self, state: ControlState | None) -> dict[str, float]:
+        """Return the targets of the joints at the end of the next command's interval, by joint name [m, rad].
+
+        A state that is missing, stale or no numbers holds the last command, and is counted in `held`. Before the first
+        good state there is no command, and the result is empty.
+
+        Args:
+            state: The measured state; None where there is none.
+
+        Raises:
+            NotConvergedError: If `bad_states` states in a row were bad; the robot should stop.
+        """
+        plan = self.plan(state)
+        if self.lost:
+            raise NotConvergedError(
+                f"{self._bad} states in a row are missing, stale or no numbers.",
+                todo="stop the robot, and check what measures the state.",
+            )
+        if plan is None:
+            return dict(self._command)
+        before = self._command or (state.joints if state is not None else {})
+        self._command = self.limited(before, plan.targets.at(plan.acts_s + self.interval_s))
+        return dict(self._command)
+
+    def limited(self, before: Mapping[str, float], wanted: Array) -> dict[str, float]:
+        """Return targets within all limits.
+
+        Args:
+            before: The targets before, by joint; empty for none.
+            wanted: The wanted targets [m, of hinges rad], shape (joints,).
+        """
+        found = {}
+        for name, value in zip(self.joints, map(float, wanted), strict=True):
+            low, high, speed = self.limits(name)
+            last, reach = before.get(name, value), speed * self.interval_s
+            found[name] = min(max(min(max(value, last - reach), last + reach), low), high)
+        return found
+
+    @one_torch_thread()
+    def plan(self, state: ControlState | None, acts_s: float | None = None) -> ControlPlan | None:
+        """Return a plan from a measured state; None for a state that is missing, stale or no numbers.
+
+        Args:
+            state: The measured state.
+            acts_s: Time from which the plan will act [s], by default that of the state.
+        """
+        if state is None or state.fault(self.joints) or state.time_s <= self._last_s:
+            self.held += 1
+            self._bad += 1
+            return None
+        self._bad, self._last_s = 0, state.time_s
+        wall, cpu = time.perf_counter(), time.process_time()
+        objective, warm = self._objective(state, state.time_s if acts_s is None else max(acts_s, state.time_s))
+        found = self._solver.solve(objective, warm, objective.propose(warm), self._rng)
+        self._found = objective, found.values
+        self._plan = ControlPlan(
+            state_s=state.time_s,
+            acts_s=objective.acts_s,
+            targets=objective.targets(found.values),
+            cost=found.cost,
+            wall_s=time.perf_counter() - wall,
+            cpu_s=time.process_time() - cpu,
+        )
+        return self._plan
+
+    @torch.no_grad()
+    def forecast(self) -> Forecast:
+        """Return what the model predicts of the last plan.
+
+        Raises:
+            UsageError: Before the first plan.
+        """
+        if self._found is None:
+            raise UsageError("a forecast before the first plan.", todo="call plan(state) first.")
+        objective, values = self._found
+        return objective.forecast(values)

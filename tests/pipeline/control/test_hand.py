@@ -1,0 +1,251 @@
+"""Control of a hand: its shapes and limits, plans and plants, and what a task may not ask."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cgwm.cli.app import app
+from cgwm.datasets.models.model import Model, write_model
+from cgwm.datasets.rollouts.control_file import read_runs
+from cgwm.pipeline.control.hand_controller import HandController
+from cgwm.pipeline.control.hand_loop import goals_of, hand_start, run_hand
+from cgwm.pipeline.control.hand_objective import turn_to
+from cgwm.pipeline.control.hand_plant import HandModelPlant, HandScenePlant
+from cgwm.pipeline.control.hand_world import hand_world
+from cgwm.pipeline.control.planning import ControlState
+from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
+from cgwm.pipeline.validate import validate
+from cgwm.schemas import (
+    HAND_TASKS,
+    ControlResult,
+    HandTask,
+    InputDataError,
+    NotConvergedError,
+    UsageError,
+    read_any_task,
+    task_toml,
+)
+from helpers import fused_host
+from helpers.paddles import JOINTS, hand_task, write_hand
+from helpers.pushing import pushed_model
+from typer.testing import CliRunner
+
+pytestmark = [
+    pytest.mark.usefixtures("one_thread"),
+    pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU"),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("hand")
+    write_hand(found)
+    return found
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return pushed_model(visible=False)
+
+
+@pytest.fixture(scope="module")
+def controller(folder: Path, model: Model) -> HandController:
+    return HandController(model, hand_task(folder))
+
+
+def begun(controller: HandController, time_s: float = 0.0) -> ControlState:
+    task = controller.task
+    return ControlState(
+        time_s=time_s,
+        joints=dict(zip(controller.joints, controller.hand.home.tolist(), strict=True)),
+        position_m=np.array(task.start.position_m),
+        quat_wxyz=np.array(task.start.quat_wxyz),
+    )
+
+
+def test_a_box_of_few_balls_is_the_box() -> None:
+    half = np.array([0.1, 0.02, 0.04])
+    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    centers, radii = rounded_hull(half * signs, 16)
+    assert len(radii) == 8
+    for axis in np.eye(3):
+        assert (centers @ axis + radii).max() == pytest.approx(half @ axis, abs=1e-12)
+
+
+def test_a_shape_with_too_many_corners_keeps_those_that_reach_farthest() -> None:
+    ball = np.random.default_rng(0).normal(size=(300, 3))
+    ball *= 0.03 / np.linalg.norm(ball, axis=1, keepdims=True)
+    centers, radii = rounded_hull(ball, 24)
+    assert len(radii) <= 24
+    reach = (centers @ ball.T / 0.03 + radii[:, None]).max(0)
+    assert 0.7 * 0.03 < reach.min() and reach.max() < 1.05 * 0.03
+
+
+def test_the_world_has_the_hand_of_the_file(controller: HandController) -> None:
+    hand = controller.hand
+    assert hand.joints == JOINTS
+    assert hand.world.body_names == ["palm", "arm", "tip", "cube"]
+    assert (hand.lower.tolist(), hand.upper.tolist()) == ([-1.5, -0.5], [1.5, 0.5])
+    assert not controller.slow
+
+
+def test_no_target_exceeds_range_or_speed_whatever_the_noise(controller: HandController) -> None:
+    controller.restart(0)
+    objective, _ = controller._objective(begun(controller), 0.05)
+    values = torch.as_tensor(np.random.default_rng(0).normal(0, 50, (40, *objective.shape)))
+    targets = objective.within_limits(values).numpy()
+    assert (targets >= controller.hand.lower - 1e-12).all() and (targets <= controller.hand.upper + 1e-12).all()
+    speeds = np.abs(np.diff(targets, axis=1)) / np.diff(objective.times_s)[:, None]
+    assert speeds.max() <= controller.task.limits.speed_rad_s * (1 + 1e-9)
+
+
+def test_equal_seeds_give_equal_commands_and_bad_states_hold_them(controller: HandController) -> None:
+    controller.aim((math.cos(0.2), 0, 0, math.sin(0.2)))
+    found = []
+    for _ in range(2):
+        controller.restart(3)
+        found.append(controller.command(begun(controller)))
+    assert found[0] == found[1] and set(found[0]) == set(JOINTS)
+    assert controller.command(None) == found[1]
+    broken = begun(controller, 1.0)
+    broken.joints["swing"] = math.nan  # pyright: ignore[reportIndexIssue]
+    assert controller.command(broken) == found[1] and controller.held == 2
+    for _ in range(controller.task.planner.bad_states - 3):
+        controller.command(None)
+    with pytest.raises(NotConvergedError, match="30 states in a row"):
+        controller.command(None)
+    with pytest.raises(UsageError, match="orientation"):
+        controller.aim((0, 0, 0, 0))
+
+
+def test_a_plan_turns_the_object_the_way_that_is_wanted(controller: HandController) -> None:
+    for side in (1, -1):
+        controller.restart(0)
+        controller.aim((math.cos(0.3), 0, 0, side * math.sin(0.3)))
+        plan = controller.plan(begun(controller))
+        assert plan is not None
+        last = controller.forecast().quat_wxyz[-1]
+        if plan.targets.values_m[-1, 0] > 0.1:  # the paddle comes from below and can push up alone
+            assert np.isfinite(last).all()
+    still = controller._objective(begun(controller), 0.0)[0]
+    assert plan.cost <= float(still.costs(torch.zeros(1, *still.shape))[0]) + 1e-9
+
+
+def test_turns_are_measured_the_shorter_way() -> None:
+    goal = torch.tensor([math.cos(0.4), 0.0, 0.0, math.sin(0.4)], dtype=torch.float64)
+    for quat in (goal, -goal):
+        assert float(turn_to(quat[None], goal).norm()) == pytest.approx(0, abs=1e-9)
+    assert float(turn_to(torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64), goal).norm()) == pytest.approx(0.8)
+
+
+def test_goals_are_the_turn_of_the_task_or_far_enough_apart(folder: Path) -> None:
+    turn = hand_task(folder, goal={"turn_deg": 90.0}, start={"turn_deg": (-180.0, 180.0)})
+    start, goal = hand_start(turn, 5)[1], next(goals_of(turn, 5))
+    assert math.degrees(float(turn_to(torch.as_tensor(start)[None], torch.as_tensor(goal)).norm())) == pytest.approx(90)
+    far = goals_of(hand_task(folder, goal={"kind": "random", "turn_deg": 60.0}), 1)
+    drawn = [torch.as_tensor(next(far)) for _ in range(8)]
+    for one, other in pairwise(drawn):
+        assert math.degrees(float(turn_to(one[None], other).norm())) >= 60
+
+
+@pytest.mark.parametrize("kind", [HandModelPlant, HandScenePlant])
+def test_both_plants_move_the_joint_that_is_commanded(controller: HandController, kind: type) -> None:
+    plant = kind(controller.hand)
+    before = plant.reset(*hand_start(controller.task, 0))
+    np.testing.assert_allclose(before.joints_rad, controller.hand.home, atol=1e-9)
+    for _ in range(4):
+        after = plant.advance(np.array([-0.5, 0.0]), 0.05)  # away from the cube
+    assert after.joints_rad[0] < -0.2 and abs(after.joints_rad[1]) < 0.05
+    assert np.linalg.norm(after.position_m - before.position_m) < 0.003
+
+
+def test_a_run_ends_at_its_time_or_when_the_object_is_dropped(controller: HandController) -> None:
+    plant = HandScenePlant(controller.hand)
+    found = run_hand(controller, plant, 0, "ideal")
+    assert (found.ended, found.goals, len(found.commands["time_s"])) == ("timeout", 0, 6)
+    plant.reset = lambda *_: HandScenePlant.reset(plant, np.array([0.0, 0.06, 0.5]), np.array([1.0, 0, 0, 0]))
+    assert run_hand(controller, plant, 0, "ideal").ended == "dropped"
+
+
+def test_the_verb_runs_a_hand_and_its_run_is_valid(folder: Path, model: Model, tmp_path: Path) -> None:
+    write_model(tmp_path / "model", model)
+    task = hand_task(folder, plant={"kind": "mujoco"})
+    (folder / "task.toml").write_text(task_toml(task))
+    words = ["control", str(tmp_path / "model"), str(folder / "task.toml"), "--out", str(tmp_path / "run")]
+    done = CliRunner().invoke(app, [*words, "--clock", "ideal"])
+    assert done.exit_code == 0, done.output
+    result = ControlResult.model_validate_json((tmp_path / "run" / "control.json").read_text())
+    assert result.sentence == (
+        "0 of 1 runs reached the goal within 5 deg; 1 ran out of time; plans acted at once (ideal clock)."
+    )
+    report = validate(tmp_path / "run")
+    assert (report.kind, report.faults) == ("run", ())
+    page = (tmp_path / "run" / "control.html").read_text()
+    assert "Joints" in page and ">swing" in page and "Contact force" not in page
+    recorded = read_runs(tmp_path / "run" / "run.h5")[0]
+    assert recorded.joints == JOINTS and recorded.arrays["obs/joints"].shape == (6, 2)
+
+
+def test_printed_tasks_are_read_again(tmp_path: Path) -> None:
+    for name, task in HAND_TASKS.items():
+        (tmp_path / f"{name}.toml").write_text(task_toml(task))
+        assert read_any_task(tmp_path / f"{name}.toml").model_dump() == task.model_dump()
+
+
+@pytest.mark.parametrize(
+    ("sections", "words"),
+    [
+        ({"limits": {"joints": {"swnig": (0, 1)}}}, "the hand has no joint 'swnig'; .* Did you mean 'swing'?"),
+        ({"start": {"joints": {"swing": 2.0}}}, "'swing' = 2 rad"),
+        ({"robot": {"friction": {"thumb": 0.3}}}, "the hand has no link 'thumb'"),
+        ({"start": {"position_m": (-0.03, 0.0, 0.035)}}, "the start: .*inside"),
+        ({"goal": {"position_m": (-0.03, 0.0, 0.035)}}, "position_m: .*inside"),
+        ({"robot": {"file": "nothing.xml"}}, "nothing.xml"),
+        ({"limits": {"joints": {"lift": (0.2, 0.1)}}}, "a range is"),
+    ],
+)
+def test_what_a_hand_cannot_do_is_refused(folder: Path, model: Model, sections: dict, words: str) -> None:
+    with pytest.raises(InputDataError, match=words):
+        hand_world(model, hand_task(folder, **sections))
+
+
+def test_a_hand_without_servos_needs_a_gain(tmp_path: Path, model: Model) -> None:
+    write_hand(tmp_path, servos="")
+    with pytest.raises(InputDataError, match=r"joint 'swing' of hand\.xml has no servo"):
+        hand_world(model, hand_task(tmp_path))
+    assert hand_world(model, hand_task(tmp_path, servo={"stiffness": 2.0, "damping": 0.1})).joints == JOINTS
+    with pytest.raises(ValueError, match="greater than 0"):
+        hand_task(tmp_path, servo={"stiffness": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("plant", "words"),
+    [
+        ({"body": "thign"}, "no free body 'thign'"),
+        ({"scene": "hand.xml"}, "no free body"),
+        ({"scene": "no.xml"}, "no.xml"),
+    ],
+)
+def test_a_scene_that_lacks_something_is_refused(folder: Path, model: Model, plant: dict, words: str) -> None:
+    found = hand_world(model, hand_task(folder, plant=plant))
+    with pytest.raises(InputDataError, match=words):
+        HandScenePlant(found)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"planner": {"horizon_s": 0.01}}, "shorter than one command"),
+        ({"plant": {"kind": "mujoco"}}, "needs plant.scene"),
+        ({"robot": {"quat_wxyz": (1.0, 1.0, 0.0, 0.0)}}, "not of length 1"),
+        ({"goal": {"axis": (0.0, 0.0, 0.0)}}, "goal.axis is zero"),
+    ],
+)
+def test_a_task_that_contradicts_itself_is_refused(changes: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        HandTask.model_validate(changes)
