@@ -21,11 +21,12 @@ def export(
     emit: Emit,
     thing: Annotated[Path, typer.Argument(metavar="THING", help="A dataset or a model.", show_default=False)],
     to: Annotated[
-        Literal["lerobot", "bop", "nerfstudio", "mjcf", "urdf", "usd", "ply", "colmap", "glb"],
+        Literal["lerobot", "bop", "nerfstudio", "rerun", "mjcf", "urdf", "usd", "ply", "colmap", "glb"],
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help="For a dataset: lerobot (v3), bop (scenewise), nerfstudio (transforms.json of one rollout). "
+            help="For a dataset: lerobot (v3), bop (scenewise), nerfstudio (transforms.json of one rollout), "
+            "rerun (.rrd of one rollout). "
             "For a model: mjcf, urdf, usd (with physics), ply (3D Gaussian splatting), colmap, "
             "glb (KHR_gaussian_splatting).",
             show_default=False,
@@ -37,8 +38,8 @@ def export(
             "--out",
             "-o",
             metavar="PATH",
-            help="The directory to write; for mjcf an .xml, for usd a .usda, for glb a .glb, for ply a directory or a "
-            "single .ply.",
+            help="The directory to write; for mjcf an .xml, for usd a .usda, for glb a .glb, for rerun an .rrd, "
+            "for ply a directory or a single .ply.",
             show_default=False,
         ),
     ],
@@ -48,18 +49,24 @@ def export(
     cameras: Annotated[
         str | None,
         typer.Option(
-            "--cameras", metavar="NAME,...", help="lerobot, bop, nerfstudio: only these (all).", show_default=False
+            "--cameras",
+            metavar="NAME,...",
+            help="lerobot, bop, nerfstudio, rerun: only these (all).",
+            show_default=False,
         ),
     ] = None,
     every: Annotated[
         int | None,
-        typer.Option("--every", min=1, help="lerobot, bop, nerfstudio: every n-th frame (1).", show_default=False),
+        typer.Option(
+            "--every", min=1, help="lerobot, bop, nerfstudio, rerun: every n-th frame (1).", show_default=False
+        ),
     ] = None,
     task: Annotated[
         str | None, typer.Option("--task", help="lerobot: description of the task.", show_default=False)
     ] = None,
     rollout: Annotated[
-        int | None, typer.Option("--rollout", min=0, help="nerfstudio: index of the rollout (0).", show_default=False)
+        int | None,
+        typer.Option("--rollout", min=0, help="nerfstudio, rerun: index of the rollout (0).", show_default=False),
     ] = None,
     mask: Annotated[
         Literal["none", "scene", "bodies"] | None,

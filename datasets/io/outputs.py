@@ -36,7 +36,7 @@ DirectoryKind = Literal[
 ]  # fmt: skip
 FileKind = Literal[
     "page", "MJCF file", "USD file", "glTF file", "splat file", "index", "effect", "effect template", "calibration",
-    "truth", "track file", "manifest",
+    "truth", "track file", "manifest", "Rerun recording",
 ]  # fmt: skip
 
 _DIRECTORY_KINDS = frozenset(get_args(DirectoryKind))
@@ -353,6 +353,7 @@ _RECOGNISED: Mapping[str, Callable[[Path], bool]] = {
     "MJCF file": _is_mjcf,
     "USD file": _head(b"#usda 1.0", b"Written by cgwm"),
     "glTF file": _head(b"glTF", b'"generator":"cgwm"'),
+    "Rerun recording": _head(b"RRF2", b"cgwm"),
     "splat file": _head(b"ply\n", b"comment unit metre\ncomment frame "),
     "index": _is_index,
     "effect": _is_unchanged,

@@ -17,6 +17,7 @@ from ...datasets.exports.colmap import write_colmap
 from ...datasets.exports.glb import write_glb
 from ...datasets.exports.lerobot import write_lerobot
 from ...datasets.exports.nerfstudio import MaskUse, place_of, write_nerfstudio
+from ...datasets.exports.rerun_log import require_rerun, write_rerun
 from ...datasets.exports.selection import Selection
 from ...datasets.exports.splat_files import in_world, write_splat_files
 from ...datasets.exports.urdf import write_urdf
@@ -31,9 +32,9 @@ from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
 from ...schemas.quantities import MOST_DURATION_S
 from .soundness import require_sound, require_sound_files
 
-DATASET_FORMATS: tuple[ExportFormat, ...] = ("lerobot", "bop", "nerfstudio")
+DATASET_FORMATS: tuple[ExportFormat, ...] = ("lerobot", "bop", "nerfstudio", "rerun")
 MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "urdf", "usd", "ply", "colmap", "glb")
-SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "usd": ".usda", "glb": ".glb"}
+SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "usd": ".usda", "glb": ".glb", "rerun": ".rrd"}
 """Suffixes of the formats that are single files."""
 LEAST_DURATION_S = 0.02
 """Shortest motion that is compared with MuJoCo [s]: two of its frames."""
@@ -47,6 +48,7 @@ NERFSTUDIO_NOTE = (
     "time runs from 0 to 1; nerfstudio keeps the metres with --orientation-method none --center-method none "
     "--auto-scale-poses False"
 )
+RERUN_NOTE = "pictures are JPEG and depth has steps of 1 mm; distortion of cameras, forces and parameters are left out"
 NO_TURNING = "in the .ply and .glb the bodies keep the light of the photos, whatever their orientation"
 NO_START = "the model has jointed bodies: the MJCF has no start, and no motion of it was compared, only places of links"
 URDF_NOTE = "a URDF has no contact law and no pose of what moves freely; each body and each jointed body has a file"
@@ -92,6 +94,7 @@ OPTIONS: dict[ExportFormat, tuple[str, ...]] = {
     "lerobot": ("split", "cameras", "every", "task"),
     "bop": ("split", "cameras", "every"),
     "nerfstudio": ("rollout", "cameras", "every", "mask"),
+    "rerun": ("rollout", "cameras", "every"),
     "mjcf": ("seed", "duration_s"),
     "urdf": ("seed",),
     "usd": ("seed",),
@@ -107,6 +110,7 @@ _KINDS: dict[ExportFormat, DirectoryKind | FileKind] = {
     "lerobot": "LeRobot dataset",
     "bop": "BOP dataset",
     "nerfstudio": "nerfstudio capture",
+    "rerun": "Rerun recording",
     "mjcf": "MJCF file",
     "urdf": "URDF folder",
     "usd": "USD file",
@@ -124,9 +128,9 @@ def export(
     """Write a dataset or a model in another format.
 
     Args:
-        thing: DATASET for lerobot, bop and nerfstudio; MODEL for mjcf, urdf, usd, ply, colmap and glb.
+        thing: DATASET for lerobot, bop, nerfstudio and rerun; MODEL for mjcf, urdf, usd, ply, colmap and glb.
         format_: The format.
-        out: The file (.xml, .usda, .glb, .ply) or directory to write; it appears once it is complete.
+        out: The file (.xml, .usda, .glb, .ply, .rrd) or directory to write; it appears once it is complete.
         options: Options of the format.
         overwrite: Replace what exists.
 
@@ -176,6 +180,13 @@ def _nerfstudio(thing: Path, out: Path, options: ExportOptions, overwrite: bool)
     chosen = _selected(thing, options)
     require_sound(chosen, read_model(thing / chosen.manifest.model), [place_of(chosen, options.rollout)])
     return write_nerfstudio(out, chosen, options.rollout, options.mask, overwrite), [*chosen.notes, NERFSTUDIO_NOTE]
+
+
+def _rerun(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    require_rerun()
+    chosen = _selected(thing, options)
+    require_sound(chosen, read_model(thing / chosen.manifest.model), [place_of(chosen, options.rollout)])
+    return write_rerun(out, chosen, options.rollout, overwrite), [*chosen.notes, RERUN_NOTE]
 
 
 def _selected(thing: Path, options: ExportOptions) -> Selection:
@@ -341,6 +352,7 @@ _WORK: dict[ExportFormat, Callable[[Path, Path, ExportOptions, bool], tuple[Fact
     "lerobot": _lerobot,
     "bop": _bop,
     "nerfstudio": _nerfstudio,
+    "rerun": _rerun,
     "mjcf": _mjcf,
     "urdf": _urdf,
     "usd": _usd,

@@ -23,6 +23,7 @@ EXTRAS = {
     "ros": "cgwm import rosbag",
     "usd": "cgwm export --to usd",
     "lerobot": "cgwm export --to lerobot",
+    "rerun": "cgwm export --to rerun",
     "ray": "cgwm synthesize --ray",
 }
 """Extras that a user may want, and what each is for; the others are for work on cgwm itself."""

@@ -113,6 +113,7 @@ ON_DATASETS = (
     command("export dataset --to bop --out OUT", weight=0.5),
     command("export dataset --to nerfstudio --out OUT", weight=0.5),
     command("export dataset --to lerobot --out OUT", weight=0.3),
+    command("export dataset --to rerun --out OUT.rrd", weight=0.3),
     command("merge dataset --out OUT.h5", weight=0.7),
     command("eval model dataset --split train", weight=0.5),
     command("view dataset --port 0 --no-open", weight=0.5, serves=True),
