@@ -135,6 +135,29 @@ def elbow(root: Path) -> None:
     write_tosses(root / "elbow", [0, 1, 2])
 
 
+MJCF = """<mujoco><worldbody><body name="upper"><freejoint/><geom type="box" size="0.05 0.025 0.025" mass="0.4"/>
+<body name="lower" pos="-0.035 0.06 0"><joint name="hinge" axis="0 1 0" range="-2 2"/>
+<geom type="box" size="0.05 0.025 0.025" pos="0.035 0 0" mass="0.3"/></body></body></worldbody></mujoco>
+"""
+
+
+def jointed(root: Path) -> None:
+    """Write a capture of tosses of two links with a hinge, described by a URDF."""
+    from cgwm.datasets import import_elbow
+
+    elbow(root)
+    import_elbow(root / "elbow", root / "capture")
+
+
+def jointed_mjcf(root: Path) -> None:
+    """Write the same capture with an MJCF."""
+    jointed(root)
+    (root / "capture" / "elbow.urdf").unlink()
+    (root / "capture" / "elbow.xml").write_text(MJCF, encoding="utf-8")
+    manifest = root / "capture" / "capture.toml"
+    manifest.write_text(manifest.read_text("utf-8").replace('urdf = "elbow.urdf"', 'mjcf = "elbow.xml"'), "utf-8")
+
+
 def pinwm(root: Path) -> None:
     """Write pushes as PIN-WM publishes them."""
     from datasets.importers import test_pinwm

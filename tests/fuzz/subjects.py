@@ -30,6 +30,8 @@ from .recordings import (
     csv,
     elbow,
     hdf5,
+    jointed,
+    jointed_mjcf,
     jugglebot,
     nerfstudio,
     phone_photos,
@@ -129,6 +131,8 @@ SUBJECTS = {
     for subject in (
         Subject("tracks", "captures", tracks, (VALIDATE, FIT, EVAL, COMPARE, DIAGNOSE, IMPROVE), ("capture/**/*",), 3),
         Subject("photos", "captures", photographed, (VALIDATE, SPLATS), ("capture/**/*",), 2),
+        Subject("jointed", "captures", jointed, (VALIDATE,), ("capture/**/*",), 0.5),
+        Subject("jointed mjcf", "captures", jointed_mjcf, (VALIDATE,), ("capture/elbow.xml",), 0.5),
         Subject("filmed", "captures", filmed, (VALIDATE, FIT_IMAGES), ("capture/**/*",), 1),
         Subject("video file", "captures", video_file, (VALIDATE, FIT_IMAGES), ("capture/videos/**/*.mp4",), 0.5),
         Subject(

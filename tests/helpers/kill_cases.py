@@ -148,6 +148,11 @@ def _urdf(folder: Path) -> Command:
     return Command(words=["export", str(model), "--to", "urdf", "--out", str(folder / "out")], out=("out",))
 
 
+def _usd(folder: Path) -> Command:
+    model = write_small_model(folder / "model")
+    return Command(words=["export", str(model), "--to", "usd", "--out", str(folder / "out.usda")], out=("out.usda",))
+
+
 def _improve(folder: Path) -> Command:
     capture, model = write_capture(folder / "capture", 3), write_small_model(folder / "model")
     words = ["improve", str(capture), "--from", str(model), "--split", "test", "--steps", "1"]
@@ -200,6 +205,7 @@ CASES: dict[str, Callable[[Path], Command]] = {
     "export mjcf": _mjcf,
     "export mjcf --overwrite": _replacing(_mjcf, "--seed", "5"),
     "export urdf": _urdf,
+    "export usd": _usd,
     "import csv": _import,
     "import video": _import_video,
     "improve": _improve,

@@ -301,8 +301,7 @@ def _faults(place: Place, after_s: float, operation: int) -> tuple[list[str], st
     if not place.exists() and place.old:
         when = "between"  # the old one has another name for an instant; the next run gives it back
     again = place.run([*command.words, *command.again])
-    kept = state == place.new and not command.again and "--overwrite" not in command.words
-    if again.code != (2 if kept else 0):
+    if again.code:  # the same command keeps what it has made, and ends with 0
         found.append(f"the next run ends with {again.code}: {again.said.strip()}")
     elif place.state() != place.new:
         found.append(f"the next run gives another output: {_difference(place.new, place.state())}")

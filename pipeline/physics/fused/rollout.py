@@ -102,7 +102,8 @@ def roll(
         raise UsageError("the fused kernel has no derivatives of the contact record.", "record_contacts=False.")
     batch, count, bodies = packed.table.shape[0], times_s.shape[-1], len(world.bodies)
     structure = packed.structure
-    chosen = lanes or lanes_for(structure.contacts, batch, structure.single, dual, structure.paired)
+    shape = (structure.contacts, batch, structure.single, dual, structure.paired)
+    chosen = lanes or lanes_for(*shape, chained=structure.tree is not None)
     structure = replace(structure, dual=dual, lanes=chosen)
     frames = values[0].new_empty(batch, count, bodies, FRAME_WIDTH)
     frame_tangents = torch.empty_like(frames) if dual else None

@@ -28,6 +28,10 @@ _LONG_LIST = 8
 """Number of constants from which a list is an array in memory, and not a chain of comparisons."""
 _BUSY_THREADS = 262_144
 """Number of threads that fill an H200; more environments get fewer threads each."""
+_BUSY_CHAINED = 16_384
+"""The same where links move, whose motion each thread of an environment computes: measured on an H100 with 4,096 hands,
+where 4 threads each are the fastest.
+"""
 _FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
 """Number of contacts that fit into the registers of a thread, by (single precision, with derivatives)."""
 
@@ -227,10 +231,13 @@ def kernel_file(name: str) -> str:
     return "\n" + kernel_build.source_file(__name__, f"kernels/{name}.cuh")
 
 
-def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool) -> int:
+def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool, chained: bool = False) -> int:
     """Return the number of threads that should share an environment, a power of two up to 32."""
-    wanted = min(contacts, 32) if paired else min(contacts, _BUSY_THREADS // max(1, environments))
-    wanted = max(wanted, -(-contacts // _FREE_SLOTS[single, dual]), 1)
+    if chained:
+        wanted = min(contacts, _BUSY_CHAINED // max(1, environments))
+    else:
+        wanted = min(contacts, 32) if paired else min(contacts, _BUSY_THREADS // max(1, environments))
+        wanted = max(wanted, -(-contacts // _FREE_SLOTS[single, dual]))
     lanes = 1
     while lanes < min(wanted, 32):
         lanes *= 2

@@ -583,22 +583,31 @@ struct Load {  // what the contacts of a pair do to their bodies: change of a's 
     Vec linear_a, linear_b, turn_a, turn_b;
 };
 
+struct Pushed {  // impulse of the contacts of a pair on a, and their moments about both centres of mass
+    Vec linear, angular_a, angular_b;
+};
+
 // Sums the impulses of the contacts from `first` to `end`, which belong to one pair, over the lanes.
-INLINE Load load_of(const Environment& env, const Contact* list, int first, int end, int a, int b,
-                    const Motion* motions) {
-    Vec linear = none(), angular_a = none(), angular_b = none();
+INLINE Pushed pushed_by(const Environment& env, const Contact* list, int first, int end, int b) {
+    Pushed sum = {none(), none(), none()};
+    const bool both = b >= 0 && is_free(b);
     for (int i = first; i < end; i++) {
         const Contact& c = list[i];
-        linear = linear + c.impulse;
-        angular_a = angular_a + cross(c.arm, c.impulse);
-        if (b >= 0) angular_b = angular_b + cross(c.arm_b, c.impulse);
+        sum.linear = sum.linear + c.impulse;
+        sum.angular_a = sum.angular_a + cross(c.arm, c.impulse);
+        if (both) sum.angular_b = sum.angular_b + cross(c.arm_b, c.impulse);
     }
-    linear = env.lanes.sum(linear);
-    Load load = {motions[a].inverse_mass * linear, none(), motions[a].inverse_inertia * env.lanes.sum(angular_a),
-                 none()};
-    if (b >= 0) {
-        load.linear_b = motions[b].inverse_mass * linear;
-        load.turn_b = motions[b].inverse_inertia * env.lanes.sum(angular_b);
+    sum.linear = env.lanes.sum(sum.linear);
+    sum.angular_a = env.lanes.sum(sum.angular_a);
+    if (both) sum.angular_b = env.lanes.sum(sum.angular_b);
+    return sum;
+}
+
+INLINE Load load_of(const Pushed& pushed, int a, int b, const Motion* motions) {
+    Load load = {motions[a].inverse_mass * pushed.linear, none(), motions[a].inverse_inertia * pushed.angular_a, none()};
+    if (b >= 0 && is_free(b)) {
+        load.linear_b = motions[b].inverse_mass * pushed.linear;
+        load.turn_b = motions[b].inverse_inertia * pushed.angular_b;
     }
     return load;
 }
@@ -795,7 +804,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
         ends[p] = count;
     }
     split(list, count, groups);
-    Load loads[PAIR_ROOM];
+    Pushed pushed[PAIR_ROOM];
     if (!env.lanes.any(count > 0)) {
         forget(env);
 #if LINKS
@@ -840,7 +849,7 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #endif
 #if PAIRED
     const int first_sweep = sweep;
-    const bool loads_count = env.lanes.any(loaded > 1);  // the whole warp takes part in the sums of `load_of`
+    const bool loads_count = env.lanes.any(loaded > 1);  // the whole warp takes part in the sums of `pushed_by`
     bool active[PAIR_ROOM];
     for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) active[p] = env.lanes.any(ends[p] > first);
 #endif
@@ -850,7 +859,9 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #if PAIRED
         if (loaded > 1 && sweep != first_sweep) {
             for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) {
-                if (active[p]) aim_under_load(env.laws[pair_law(p)], list, first, ends[p], loads[p], motions);
+                if (!active[p]) continue;
+                Load load = load_of(pushed[p], pair_a(p), pair_b(p), motions);
+                aim_under_load(env.laws[pair_law(p)], list, first, ends[p], load, motions);
             }
         }
         for (int i = 0; i < count; i++) {
@@ -894,21 +905,33 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
             gain(env.chain, l, motions[b].velocity, motions[b].omega);
         }
 #endif
+#if PAIRED
+        if (loads_count) {  // sums by pair, of which those by body are made without further exchanges
+            for (int b = 0; b < BODIES; b++) linear[b] = angular[b] = none();
+            for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) {
+                if (!active[p]) continue;
+                int a = pair_a(p), b = pair_b(p);
+                pushed[p] = pushed_by(env, list, first, ends[p], b);
+                linear[a] = linear[a] + pushed[p].linear;
+                angular[a] = angular[a] + pushed[p].angular_a;
+                if (b < 0) continue;
+                linear[b] = linear[b] - pushed[p].linear;
+                angular[b] = angular[b] - pushed[p].angular_b;
+            }
+        }
+#else
+        const bool loads_count = false;
+#endif
         EACH_BODY
         for (int b = 0; b < BODIES; b++) {
             if (!is_free(b)) continue;
-            linear[b] = env.lanes.sum(linear[b]);
-            angular[b] = env.lanes.sum(angular[b]);
+            if (!loads_count) {
+                linear[b] = env.lanes.sum(linear[b]);
+                angular[b] = env.lanes.sum(angular[b]);
+            }
             motions[b].velocity = free_velocities[b] + motions[b].inverse_mass * linear[b];
             motions[b].omega = free_omegas[b] + motions[b].inverse_inertia * angular[b];
         }
-#if PAIRED
-        if (loads_count && sweep + 1 < problem.sweeps) {
-            for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) {
-                if (active[p]) loads[p] = load_of(env, list, first, ends[p], pair_a(p), pair_b(p), motions);
-            }
-        }
-#endif
     } while (++sweep < problem.sweeps);
     keep(env, list, count, problem.sweeps);
     EACH_BODY

@@ -192,7 +192,7 @@ def test_edges_that_cross(fused: Fused) -> None:
 def test_a_plank_that_lies_across_another_one_rests_on_the_four_points_where_their_edges_cross(fused: Fused) -> None:
     world, _ = planks()
     low, top = (((0, 0, z), (1, 0, 0, turn), (0, 0, 0), (0, 0, 0)) for z, turn in ((0.01995, 0), (0.0599, 1)))
-    found = fused(world, state_of(low, top, count=2), times(0.3), None, True, lanes=None)
+    found = on_device(fused(world, state_of(low, top, count=2), times(0.3), None, True, lanes=None), "cpu")
     contacts = found.contacts
     assert contacts is not None
     carried = contacts.impulse_n_s[0, -1][contacts.body_b == 1]
@@ -917,3 +917,5 @@ def test_threads_of_an_environment() -> None:
     assert lanes_for(8, 10**6, single=False, dual=True, paired=False) == 8
     assert lanes_for(500, 1, single=True, dual=False, paired=True) == 32
     assert lanes_for(0, 1, single=True, dual=False, paired=False) == 1
+    hands = [lanes_for(1245, count, single=True, dual=False, paired=True, chained=True) for count in (1, 4096, 10**6)]
+    assert hands == [32, 4, 1]
