@@ -113,17 +113,16 @@ class _Noise:
     """Error just after an impact [m]."""
 
     def covariance(self, time: Array) -> Array:
-        """Return the covariance (n, n) of the heights at times (n,)."""
-        apart = np.abs(time[:, None] - time)
-        bend = 0.5 * time**2
+        """Return the covariance (..., n, n) of the heights at times (..., n)."""
+        one, other = time[..., :, None], time[..., None, :]
         # a ball that still deforms after an impact is not where its centroid is measured
-        later = np.maximum(time[:, None], time)
-        shaken = self.shaken_m**2 * np.exp(-2 * later / SHAKEN_S) if time[0] > 0 else 0.0
+        after = time[..., :1, None] > 0
+        shaken = after * self.shaken_m**2 * np.exp(-2 * np.maximum(np.maximum(one, other), 0.0) / SHAKEN_S)
         return (
             shaken
-            + (self.white_m**2 + 1e-12) * np.eye(len(time))
-            + self.slow_m**2 * np.exp(-apart / self.time_s)
-            + self.lift_m_s2**2 * np.outer(bend, bend)
+            + (self.white_m**2 + 1e-12) * np.eye(time.shape[-1])
+            + self.slow_m**2 * np.exp(-np.abs(one - other) / self.time_s)
+            + self.lift_m_s2**2 * (0.5 * one**2) * (0.5 * other**2)
         )
 
 
@@ -162,6 +161,37 @@ class _Flight:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Flights:
+    """Flights (n) in one batch, the shorter ones padded to F frames."""
+
+    time: Array
+    """Times, 0 where there is no frame, shape (n, F) [s]."""
+    known: NDArray[np.bool_]
+    """Whether there is a frame, shape (n, F)."""
+    columns: Array
+    """1, t, D(t) and the heights, 0 where there is no frame, shape (n, F, 4)."""
+
+    @staticmethod
+    def of(flights: Sequence[_Flight]) -> _Flights:
+        """Return flights as a batch."""
+        most = max(len(flight.time) for flight in flights)
+        time, known = np.zeros((len(flights), most)), np.zeros((len(flights), most), bool)
+        columns = np.zeros((len(flights), most, 4))
+        for row, flight in enumerate(flights):
+            count = len(flight.time)
+            time[row, :count], known[row, :count] = flight.time, True
+            columns[row, :count] = np.column_stack([flight.basis, flight.drag, flight.height])
+        return _Flights(time=time, known=known, columns=columns)
+
+    def whitened(self, noise: _Noise) -> tuple[Array, Array]:
+        """Return the inner products (n, 4, 4) of whitened columns, and the log determinants (n,) of the covariances."""
+        both = self.known[:, :, None] & self.known[:, None]
+        factor = np.linalg.cholesky(np.where(both, noise.covariance(self.time), np.eye(self.time.shape[1])))
+        white = np.linalg.solve(factor, self.columns)
+        return white.swapaxes(1, 2) @ white, 2 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(1)
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Solved:
     """Flights (n) under a noise: states at the bounce without drag, and what drag adds."""
 
@@ -177,31 +207,21 @@ class _Solved:
     """-2 log of the restricted likelihood."""
 
     @staticmethod
-    def of(flights: Sequence[_Flight], noise: _Noise) -> _Solved:
+    def of(flights: _Flights, noise: _Noise) -> _Solved:
         """Solve all flights for their states and the common drag."""
-        states, slopes, spread = [], [], []
-        cost, pull, information = 0.0, 0.0, 1 / DRAG_PRIOR**2
-        for flight in flights:
-            factor = cho_factor(noise.covariance(flight.time), lower=True)
-            columns = np.column_stack([flight.basis, flight.drag, flight.height])
-            solved = cho_solve(factor, columns)
-            normal = flight.basis.T @ solved[:, :2]
-            inverse = np.linalg.inv(normal)
-            slope, state = inverse @ (flight.basis.T @ solved[:, 2:]).T[0], inverse @ flight.basis.T @ solved[:, 3]
-            left, bend = flight.height - flight.basis @ state, flight.drag - flight.basis @ slope
-            pull += float(bend @ solved[:, 3])
-            information += float(bend @ solved[:, 2])
-            size = 2 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(normal)[1]
-            cost += float(size + left @ solved[:, 3])
-            states.append(state)
-            slopes.append(slope)
-            spread.append(inverse)
+        product, size = flights.whitened(noise)
+        normal, mixed = product[:, :2, :2], product[:, :2, 2:]
+        inverse: Array = np.linalg.inv(normal).astype(np.float64)
+        solved = inverse @ mixed
+        # drag and heights beside the states
+        left = (product[:, 2:, 2:] - mixed.swapaxes(1, 2) @ solved).sum(0)
+        information, pull = 1 / DRAG_PRIOR**2 + left[0, 0], left[0, 1]
         drag = pull / information
-        cost += np.log(information) - drag * pull
+        cost = size.sum() + np.linalg.slogdet(normal)[1].sum() + left[1, 1] + np.log(information) - drag * pull
         return _Solved(
-            states=np.array(states),
-            slopes=np.array(slopes),
-            covariance=np.array(spread),
+            states=solved[:, :, 1],
+            slopes=solved[:, :, 0],
+            covariance=inverse,
             drag=(float(drag), float(1 / information)),
             cost=float(cost),
         )
@@ -253,7 +273,7 @@ def _flights(bounces: Sequence[Bounce], gravity: float) -> list[_Flight]:
 def _found_noise(flights: Sequence[_Flight]) -> _Noise:
     """Return the noise of greatest restricted likelihood under weak priors."""
     chosen = np.unique(np.linspace(0, len(flights) - 1, MOST_FLIGHTS).round().astype(int))
-    some = [flights[k] for k in chosen]
+    some = _Flights.of([flights[k] for k in chosen])
 
     def noise_at(x: Array) -> _Noise:
         white, slow, time, lift, shaken = (float(v) for v in np.exp(np.clip(x, -16.0, 3.0)))
@@ -293,7 +313,7 @@ class _Speeds:
     @staticmethod
     def of(bounces: Sequence[Bounce], gravity: float, noise: _Noise) -> _Speeds:
         """Return the speeds of bounces under a noise."""
-        solved = _Solved.of(_flights(bounces, gravity), noise)
+        solved = _Solved.of(_Flights.of(_flights(bounces, gravity)), noise)
         drag, variance = solved.drag
         states = (solved.states - drag * solved.slopes).reshape(-1, 2, 2)
         ground, contact_s, ground_var = _ground(states, solved.covariance.reshape(-1, 2, 2, 2))

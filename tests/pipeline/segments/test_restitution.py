@@ -8,7 +8,7 @@ import torch
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.phys_geo.tracks.contact_fit import RestitutionFit, damping_of, restitution_of
 from cgwm.pipeline.physics.contact_law import restitution
-from cgwm.pipeline.segments.restitution_fit import DRAG_PRIOR, SHAKEN_S, _Flight, _Noise, _Solved
+from cgwm.pipeline.segments.restitution_fit import DRAG_PRIOR, SHAKEN_S, _Flight, _Flights, _Noise, _Solved
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from helpers.worlds import ball_body, world_of
 
@@ -111,7 +111,7 @@ def test_flights_are_solved_as_one_linear_model() -> None:
         time = np.sort(rng.uniform(0.01, 0.2, count))
         basis = np.column_stack([np.ones(count), time])
         flights.append(_Flight(time=time, height=rng.normal(0, 0.01, count), basis=basis, drag=-3 * time**2))
-    found = _Solved.of(flights, noise)
+    found = _Solved.of(_Flights.of(flights), noise)
     size = sum(len(flight.time) for flight in flights)
     design, cover, row = np.zeros((size, 7)), np.zeros((size, size)), 0
     for k, flight in enumerate(flights):
