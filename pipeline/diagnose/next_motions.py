@@ -69,12 +69,13 @@ class Question:
             both = channel.data + channel.motions[chosen].sum(0)
             extra = np.stack([channel.motions[k] if k >= 0 else np.zeros_like(both) for k in more])
             information = both + times * extra
+            cases = information[None]
+            if channel.episodes is not None:  # without any one episode, too
+                parts = [np.broadcast_to(one, extra.shape) for one in (*channel.episodes, *channel.motions[chosen])]
+                cases = np.stack([information, *(information - part for part in (*parts, extra))])
+            every = cases.reshape(-1, *cases.shape[2:])
             for place, name in enumerate(self.names):
-                own = channel.noncentrality(information, self.sizes[place], place)
-                if channel.episodes is not None:  # without any one episode, too
-                    parts = [np.broadcast_to(one, extra.shape) for one in (*channel.episodes, *channel.motions[chosen])]
-                    for part in (*parts, extra):
-                        own = np.minimum(own, channel.noncentrality(information - part, self.sizes[place], place))
+                own = channel.noncentrality(every, self.sizes[place], place).reshape(len(cases), -1).min(0)
                 enough = own / _needed(channel, self.variants[place])
                 left = np.full(len(more), math.inf)
                 for other, rival in enumerate(self.names):
