@@ -80,7 +80,7 @@ PLANTS: dict[str, dict[str, float]] = {
     "size - 5 %": {"size_factor": 0.95},
     "size + 5 %": {"size_factor": 1.05},
     "30 ms late": {"delay_s": 0.03},
-    "3 mm, 3 deg of noise": {"noise_m": 0.003, "noise_deg": 3.0},
+    "3 mm and 3 deg of noise": {"noise_m": 0.003, "noise_deg": 3.0},
 }
 """Errors of the plant and its sensing, which the controllers do not know."""
 ELITES, SPREAD = 3, (0.1, 0.6)
