@@ -269,7 +269,7 @@ def _entry(name: str, value: object, text: str) -> list[str]:
 
 def _value(value: object) -> str:
     if isinstance(value, dict):
-        return f"{{ {', '.join(f'{name} = {_value(entry)}' for name, entry in value.items())} }}"
+        return f"{{ {', '.join(f'{name} = {_value(entry)}' for name, entry in value.items())} }}" if value else "{}"
     if isinstance(value, str):
         return f'"{value}"'
     if isinstance(value, list | tuple):

@@ -139,7 +139,8 @@ class HandScenePlant:
         try:
             self._model = self._mujoco.MjModel.from_xml_path(str(path))
         except ValueError as error:
-            raise InputDataError(f"{path}: MuJoCo cannot read it: {error}.", "an MJCF file.") from error
+            found = f"{task.source}: [plant] scene: {path}: MuJoCo cannot read it: {error}."
+            raise InputDataError(found, "an MJCF file.") from error
         self._data = self._mujoco.MjData(self._model)
         self._body = self._object(task, str(path))
         self._places = [self._joint(name, str(path)) for name in hand.joints]

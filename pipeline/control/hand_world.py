@@ -120,7 +120,7 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
     require_rigid(model)
     require_metric(model)
     free_object(model.file, task.object, task.source)
-    hand = read_articulation(task.folder / task.robot.file).welded()
+    hand = _hand(task)
     moving = tuple(joint.name for joint in hand.joints)
     wrong = require_joints(task, moving, tuple(link.name for link in hand.links))
     if wrong:
@@ -147,6 +147,20 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
     require_apart(world, begun, f"{task.source}, the start")
     _require_room(found)
     return found
+
+
+def _hand(task: HandTask) -> Articulation:
+    """Read the hand of a task."""
+    try:
+        hand = read_articulation(task.folder / task.robot.file).welded()
+    except InputDataError as error:
+        found = f"{task.source}: [robot] file: {error.found}"
+        raise InputDataError(found, error.allowed, error.todo) from error
+    if not hand.joints:
+        raise InputDataError(
+            f"{task.source}: [robot] file: {hand.path} has no joint that moves.", "a hand with hinges or slides."
+        )
+    return hand
 
 
 def _require_servos(task: HandTask, hand: Articulation) -> None:

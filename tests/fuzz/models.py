@@ -58,6 +58,16 @@ def task(root: Path) -> None:
     (root / "task.toml").write_text(task_toml(push_task(success={"timeout_s": 0.1})), encoding="utf-8")
 
 
+def hand(root: Path) -> None:
+    """Write a model, a hand, and a task for it whose runs take a second."""
+    from cgwm.schemas import task_toml
+    from helpers.paddles import hand_task, write_hand
+
+    model(root)
+    write_hand(root)
+    (root / "task.toml").write_text(task_toml(hand_task(root, success={"timeout_s": 0.1})), encoding="utf-8")
+
+
 def run(root: Path) -> None:
     """Write runs of a task."""
     from cgwm.pipeline.control import control

@@ -22,6 +22,8 @@ def rows() -> Iterator[Row]:
     for out in ("model", "docs", "task.toml"):
         words = ("control", "model", "task.toml", "--clock", "ideal", "--overwrite", "--out", out)
         yield Row(f"control --out {out}", "outputs", "task", written("docs/notes.txt", "mine"), words)
+    for name, edit in HANDS:
+        yield Row(f"hand: {name}", "hands", "hand", edit, CONTROL)
     for name, edit in RUNS:
         yield Row(f"run: {name}", "runs", "run", edit, ("validate", "run"))
 
@@ -32,6 +34,11 @@ def _without(name: str) -> Edit:
             del file[f"data/demo_0/{name}"]
 
     return edit
+
+
+def _without_scene(root: Path) -> None:
+    text(TASK, 'kind = "model"', 'kind = "mujoco"')(root)
+    (root / "scene.xml").unlink()
 
 
 def _cut(root: Path) -> None:
@@ -58,6 +65,23 @@ TASKS: tuple[tuple[str, Edit], ...] = (
     ("a model without physics", field(MODEL, "contact", "null")),
     ("a model without ground", field(MODEL, "ground", "null")),
     ("a model whose object is fixed", field(MODEL, "bodies 0 motion", '"fixed"')),
+)
+HANDS: tuple[tuple[str, Edit], ...] = (
+    ("no hand", lambda root: (root / "hand.xml").unlink()),
+    ("a hand that is no MJCF", written("hand.xml", "<mujoco><worldbody>")),
+    ("a hand without joints", written("hand.xml", "<mujoco><worldbody><body name='palm'/></worldbody></mujoco>")),
+    ("a servo that does not exist", text("hand.xml", "<position", "<motor")),
+    ("an unknown joint", text(TASK, "joints = {}", "joints = { swnig = 0.1 }")),
+    ("an unknown link", text(TASK, "friction = {}", "friction = { thumb = 0.1 }")),
+    ("a limit that is no range", text(TASK, "joints = {}", "joints = { swing = 9.0 }")),
+    ("zero gain", text(TASK, "# stiffness =", "stiffness = 0.0")),
+    ("a horizon below a command", text(TASK, "horizon_s = 0.4", "horizon_s = 0.001")),
+    ("an object in the hand", text(TASK, "position_m = [0.0, 0.06, 0.05]", "position_m = [-0.03, 0.0, 0.035]")),
+    ("no axis", text(TASK, "axis = [0.0, 0.0, 1.0]", "axis = [0.0, 0.0, 0.0]")),
+    ("MuJoCo without its scene", _without_scene),
+    ("a million samples of 60 s", text(TASK, "samples = 12", "samples = 1000000")),
+    ("a format of the future", text(TASK, "cgwm-hand-task/1", "cgwm-hand-task/2")),
+    ("a model without physics", field(MODEL, "contact", "null")),
 )
 WORDS = (
     ("without seeds", "--seeds 0"),

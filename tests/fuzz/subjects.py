@@ -19,7 +19,7 @@ from .captures import (
     with_transforms,
     write_toss_capture,
 )
-from .models import bare, custom, dataset, merged, model, plan, run, task
+from .models import bare, custom, dataset, hand, merged, model, plan, run, task
 from .recordings import (
     balldrops,
     bodies_csv,
@@ -209,6 +209,14 @@ SUBJECTS = {
             (command("control model task.toml --out OUT --clock ideal", weight=0.5),),
             ("task.toml",),
             1.0,
+        ),
+        Subject(
+            "hand",
+            "hands",
+            hand,
+            (command("control model task.toml --out OUT --clock ideal", weight=0.5),),
+            ("task.toml",),
+            0.7,
         ),
         Subject("run", "runs", run, (command("validate run"),), ("run/*",), 0.7),
         Subject(

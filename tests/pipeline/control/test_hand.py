@@ -205,7 +205,7 @@ def test_printed_tasks_are_read_again(tmp_path: Path) -> None:
         ({"robot": {"friction": {"thumb": 0.3}}}, "the hand has no link 'thumb'"),
         ({"start": {"position_m": (-0.03, 0.0, 0.035)}}, "the start: .*inside"),
         ({"goal": {"position_m": (-0.03, 0.0, 0.035)}}, "position_m: .*inside"),
-        ({"robot": {"file": "nothing.xml"}}, "nothing.xml"),
+        ({"robot": {"file": "nothing.xml"}}, r"task\.toml: \[robot\] file: .*nothing\.xml"),
         ({"limits": {"joints": {"lift": (0.2, 0.1)}}}, "a range is"),
     ],
 )
