@@ -19,6 +19,11 @@ def view(
     thing: Annotated[
         Path, typer.Argument(metavar="DATASET|MODEL", help="The dataset or model to show.", show_default=False)
     ],
+    run: Annotated[
+        Path | None,
+        typer.Option("--run", metavar="RUN", help="Runs of 'cgwm control' with this model, to replay.",
+                     show_default=False),
+    ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port to listen on; 0: any free one.")] = 8080,
     host: Annotated[
         str, typer.Option("--host", help="Address to listen on; with 0.0.0.0 everyone on the network can connect.")
@@ -28,15 +33,20 @@ def view(
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
-) -> None:
-    """Show the rollouts of a dataset, or a model and its simulated motion, in the browser until Ctrl-C."""
+) -> None:  # fmt: skip
+    """Show rollouts of a dataset, a model and its simulated motion, or runs of control, in the browser until Ctrl-C."""
     with contextlib.ExitStack() as ends:
         with running(json=json, quiet=quiet, debug=debug) as emit:
             trust(trust_effects)
-            from ..pipeline.view import open_view
+            from ..pipeline.view import open_replays, open_view
             from ..schemas import ViewReport
 
-            viewer = ends.enter_context(open_view(thing, host, port))
+            if run is None:
+                viewer = ends.enter_context(open_view(thing, host, port))
+            else:
+                from ..pipeline.control import replays_of
+
+                viewer = ends.enter_context(open_replays(f"run {run.name}", *replays_of(thing, run), host, port))
             emit(ViewReport(url=viewer.url, showing=str(thing)), _summary)
         with until_interrupted():
             if open_:

@@ -4,6 +4,7 @@ from .closed_loop import ClosedLoop, Reach, Targets, Velocity
 from .controller import Controller
 from .hand_controller import HandController
 from .planning import ControlPlan, ControlState
+from .replay import replays_of
 from .stage import control
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "Targets",
     "Velocity",
     "control",
+    "replays_of",
 ]

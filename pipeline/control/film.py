@@ -67,7 +67,7 @@ def _frames(tables: RunTables) -> list[int]:
 def _picture(found: TaskWorld, tables: RunTables, device: str) -> Callable[[int], tuple[Image, Image]]:
     """Return a function that draws plant and prediction, each (H, W, 3), at the number of a command."""
     renderer = FrameRenderer(_visible(found), _camera(found, tables), device)
-    time, plans = tables.arrays["control/time"], tables.arrays["plans/state_time"]
+    time = tables.arrays["control/time"]
 
     def drawn(pose: Array, finger: Array) -> Image:
         state = found.state(pose[:3], pose[3:], finger)
@@ -75,19 +75,29 @@ def _picture(found: TaskWorld, tables: RunTables, device: str) -> Callable[[int]
         return renderer.of(moved)[0].cpu().numpy()
 
     def pair(frame: int) -> tuple[Image, Image]:
-        now = time[frame]
         real = drawn(tables.arrays["obs/object"][frame], tables.arrays["obs/finger"][frame])
-        made = plans[plans <= now - AHEAD_S + 1e-9]
-        if not len(made):
-            return real, real
-        index = len(made) - 1
-        times = tables.arrays["plans/times"][index]
-        pose = [np.interp(now, times, column) for column in tables.arrays["plans/object"][index].T]
-        finger = [np.interp(now, times, column) for column in tables.arrays["plans/targets"][index].T]
-        pose[3:] = np.array(pose[3:]) / np.linalg.norm(pose[3:])
-        return real, drawn(np.array(pose), np.array(finger))
+        found = predicted_at(tables, float(time[frame]))
+        return real, real if found is None else drawn(*found)
 
     return pair
+
+
+def predicted_at(tables: RunTables, now_s: float) -> tuple[Array, Array] | None:
+    """Return pose (7,) of the object and x, y of the finger that a plan of a while before had predicted; None before.
+
+    Args:
+        tables: The run.
+        now_s: The time that was predicted [s].
+    """
+    made = tables.arrays["plans/state_time"]
+    index = int((made <= now_s - AHEAD_S + 1e-9).sum()) - 1
+    if index < 0:
+        return None
+    times = tables.arrays["plans/times"][index]
+    pose = np.array([np.interp(now_s, times, column) for column in tables.arrays["plans/object"][index].T])
+    finger = np.array([np.interp(now_s, times, column) for column in tables.arrays["plans/targets"][index].T])
+    pose[3:] /= np.linalg.norm(pose[3:])
+    return pose, finger
 
 
 def _visible(found: TaskWorld) -> Model:

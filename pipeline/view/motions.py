@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ...datasets.capture.cameras import Camera
 from ...datasets.models.model import Model
 from ...datasets.rollouts.loader import RolloutReader
+from ...datasets.rollouts.replay import Replay
 from ...datasets.rollouts.rollouts import ContactTable
 from ...schemas import SamplingPlan, SynthesizeConfig
 from ..synthesize.draw import draw_rollout
@@ -87,6 +88,20 @@ def still(model: Model) -> Motion:
         quat_wxyz=quat[None],
         contacts=(_no_contacts(),),
         joints={name: one.values[k : k + 1] for one in joints for k, name in enumerate(one.chain.joint_names)},
+    )
+
+
+def replayed(found: Replay) -> Motion:
+    """Return a motion that was recorded elsewhere."""
+    acts = np.linalg.norm(found.impulse_n_s, axis=-1) > 0
+    contacts: list[Contacts] = [
+        {"pos_world": place[None], "impulse_world": impulse[None], "mode": np.zeros(1, np.uint8)}
+        if act
+        else _no_contacts()
+        for act, place, impulse in zip(acts, found.contact_m, found.impulse_n_s, strict=True)
+    ]
+    return Motion(
+        times_s=found.times_s, position_m=found.position_m, quat_wxyz=found.quat_wxyz, contacts=tuple(contacts)
     )
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
 from ...datasets.io.kinds import kind_of
-from ...datasets.models.model import read_model
+from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.dataset import read_manifest
 from ...datasets.rollouts.loader import RolloutReader
+from ...datasets.rollouts.replay import Replay
 from ...schemas import InputDataError
-from .motions import Motion, can_move, own_motion, recorded_motion, still
+from .motions import Motion, can_move, own_motion, recorded_motion, replayed, still
 from .viewer import Viewer, require_viser
 
 OWN_MOTIONS = 6
@@ -33,12 +34,36 @@ def open_view(thing: Path | str, host: str = "127.0.0.1", port: int = 8080) -> V
     path = Path(thing)
     require_viser()
     kind = kind_of(path)
+    if kind == "run":
+        raise InputDataError(
+            f"{path}: runs of a task of control.", "their model, with --run.", f"cgwm view MODEL --run {path}."
+        )
     if kind == "dataset":
         return _dataset(path, host, port)
     if kind == "model":
         return _model(path, host, port)
     found = "no such directory" if not path.exists() else f"a {kind}" if kind else "neither a dataset nor a model"
     raise InputDataError(f"{path}: {found}.", "a directory with dataset.json or model.json.")
+
+
+def open_replays(
+    title: str, model: Model, motions: Mapping[str, Replay], host: str = "127.0.0.1", port: int = 8080
+) -> Viewer:
+    """Start a server that shows motions of a model, such as those of `pipeline.control.replays_of`.
+
+    Args:
+        title: Title of the page.
+        model: The model.
+        motions: The motions, by name.
+        host: Address to listen on.
+        port: Port to listen on; 0 takes a free one.
+
+    Raises:
+        UsageError: If viser is not installed, or the address is not available.
+    """
+    require_viser()
+    made = {name: partial(replayed, motion) for name, motion in motions.items()}
+    return Viewer(title, model, made, host, port, playing=True)
 
 
 def _dataset(path: Path, host: str, port: int) -> Viewer:

@@ -1,0 +1,61 @@
+"""Runs as motions of the model's bodies, for the viewer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cgwm.datasets.models.model import write_model
+from cgwm.datasets.rollouts.control_file import read_runs
+from cgwm.pipeline.control import control, replays_of
+from cgwm.pipeline.view.motions import replayed
+from cgwm.pipeline.view.stage import open_view
+from cgwm.schemas import HAND_TASKS, InputDataError, task_toml
+from helpers import fused_host
+from helpers.pushing import RADIUS, push_task, pushed_model
+
+pytestmark = [
+    pytest.mark.usefixtures("one_thread"),
+    pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU"),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("replay")
+    write_model(found / "model", pushed_model(visible=False))
+    task = push_task(goal={"position_m": [0.1, 0.0]}, success={"timeout_s": 0.8})
+    (found / "T.toml").write_text(task_toml(task))
+    control(found / "model", found / "T.toml", found / "run", clock="ideal")
+    return found
+
+
+def test_a_replay_is_what_was_recorded_and_what_was_predicted(folder: Path) -> None:
+    model, motions = replays_of(folder / "model", folder / "run")
+    assert list(motions) == ["seed 0", "seed 0, predicted 0.5 s before"]
+    assert [body.name for body in model.file.bodies] == ["cube", "tip"]
+    arrays = read_runs(folder / "run" / "run.h5")[0].arrays
+    real, ahead = motions.values()
+    np.testing.assert_array_equal(real.position_m[:, 0], arrays["obs/object"][:, :3])
+    np.testing.assert_array_equal(real.position_m[:, 1, :2], arrays["obs/finger"])
+    np.testing.assert_array_equal(ahead.position_m[:10], real.position_m[:10])  # no plan is as old
+    shift = np.linalg.norm(ahead.position_m[10:, 1] - real.position_m[10:, 1], axis=-1)
+    assert 0 < shift.max() < 0.3
+    pressed = np.linalg.norm(real.impulse_n_s, axis=-1) > 0
+    away = np.linalg.norm((real.contact_m - real.position_m[:, 1])[pressed], axis=-1)
+    np.testing.assert_allclose(away, RADIUS, rtol=1e-9)
+    shown = replayed(real)
+    assert [len(rows["mode"]) for rows in shown.contacts] == pressed.astype(int).tolist()
+
+
+def test_a_run_alone_and_that_of_a_hand_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputDataError, match="cgwm view MODEL --run"):
+        open_view(folder / "run")
+    (tmp_path / "run").mkdir()
+    document = json.loads((folder / "run" / "control.json").read_text())
+    document["settings"]["task"] = HAND_TASKS["hand"].model_dump_json()
+    (tmp_path / "run" / "control.json").write_text(json.dumps(document))
+    with pytest.raises(InputDataError, match="runs of a hand"):
+        replays_of(folder / "model", tmp_path / "run")
