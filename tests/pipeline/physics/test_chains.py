@@ -337,6 +337,10 @@ def test_what_cannot_be_a_chain_is_refused() -> None:
     servoed = replace(chain, joints=(replace(chain.joints[0], stiffness=batch(1.0)), chain.joints[1]))
     with pytest.raises(InputDataError, match="have servos and no command"):
         simulate(replace(world, chains=(servoed,)), with_joints(world, still(3), {}), times(0.01))
+    turned = with_joints(world, still(3), {})
+    turned.quat_wxyz[0, 2] = batch([math.cos(0.05), math.sin(0.05), 0.0, 0.0])[0]  # about x; the hinge turns about y
+    with pytest.raises(InputDataError, match="link 'lower' is 0 mm and 0.1 rad off its joint 'second'"):
+        simulate(world, turned, times(0.01))
 
 
 def test_links_off_their_joints_are_put_on_them_and_others_stay() -> None:
@@ -416,3 +420,5 @@ def test_a_repeated_command_has_the_rows_of_the_batch() -> None:
     again = command.repeat(3)
     assert again.coefficients.shape == (6, *command.coefficients.shape[1:])
     assert torch.equal(again.coefficients[2:4], command.coefficients)
+    shared = JointCommand.targets(torch.tensor([[0.0, 1.0]], dtype=F64), values[:1])
+    assert shared.repeat(3).coefficients.shape == shared.coefficients.shape
