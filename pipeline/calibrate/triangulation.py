@@ -1,6 +1,7 @@
 """Robust triangulation of a point from its images in many registered photos, with its covariance.
 
-The refinement is no descent of one cost, because each step chooses anew which views count; so it has a loop of its own.
+The refinement is no descent of one cost, because each step chooses anew which views count, and the solver of
+`optimization/` needs torch, which calibration does not load; so it has a loop of its own.
 """
 
 from __future__ import annotations

@@ -339,7 +339,7 @@ def test_what_cannot_be_a_chain_is_refused() -> None:
         simulate(replace(world, chains=(servoed,)), with_joints(world, still(3), {}), times(0.01))
     turned = with_joints(world, still(3), {})
     turned.quat_wxyz[0, 2] = batch([math.cos(0.05), math.sin(0.05), 0.0, 0.0])[0]  # about x; the hinge turns about y
-    with pytest.raises(InputDataError, match="link 'lower' is 0 mm and 0.1 rad off its joint 'second'"):
+    with pytest.raises(InputDataError, match=r"link 'lower' is 0 mm and 0.1 rad off its joint 'second'"):
         simulate(world, turned, times(0.01))
 
 
