@@ -21,14 +21,14 @@ def export(
     emit: Emit,
     thing: Annotated[Path, typer.Argument(metavar="THING", help="A dataset or a model.", show_default=False)],
     to: Annotated[
-        Literal["lerobot", "bop", "nerfstudio", "rerun", "mjcf", "urdf", "usd", "ply", "colmap", "glb"],
+        Literal["lerobot", "bop", "nerfstudio", "rerun", "mjcf", "urdf", "usd", "ply", "colmap", "glb", "mesh"],
         typer.Option(
             "--to",
             metavar="FORMAT",
             help="For a dataset: lerobot (v3), bop (scenewise), nerfstudio (transforms.json of one rollout), "
             "rerun (.rrd of one rollout). "
             "For a model: mjcf, urdf, usd (with physics), ply (3D Gaussian splatting), colmap, "
-            "glb (KHR_gaussian_splatting).",
+            "glb (KHR_gaussian_splatting), mesh (triangles with colours, .glb).",
             show_default=False,
         ),
     ],
@@ -38,8 +38,8 @@ def export(
             "--out",
             "-o",
             metavar="PATH",
-            help="The directory to write; for mjcf an .xml, for usd a .usda, for glb a .glb, for rerun an .rrd, "
-            "for ply a directory or a single .ply.",
+            help="The directory to write; for mjcf an .xml, for usd a .usda, for glb and mesh a .glb, for rerun "
+            "an .rrd, for ply a directory or a single .ply.",
             show_default=False,
         ),
     ],

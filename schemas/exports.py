@@ -6,7 +6,7 @@ from typing import Literal
 
 from .base import FileModel
 
-ExportFormat = Literal["lerobot", "bop", "nerfstudio", "rerun", "mjcf", "urdf", "usd", "ply", "colmap", "glb"]
+ExportFormat = Literal["lerobot", "bop", "nerfstudio", "rerun", "mjcf", "urdf", "usd", "ply", "colmap", "glb", "mesh"]
 
 
 class ExportResult(FileModel):

@@ -16,6 +16,7 @@ from ...datasets.exports.bop_models import ObjectModel
 from ...datasets.exports.colmap import write_colmap
 from ...datasets.exports.glb import write_glb
 from ...datasets.exports.lerobot import write_lerobot
+from ...datasets.exports.mesh_glb import write_mesh_glb
 from ...datasets.exports.nerfstudio import MaskUse, place_of, write_nerfstudio
 from ...datasets.exports.rerun_log import require_rerun, write_rerun
 from ...datasets.exports.selection import Selection
@@ -33,8 +34,8 @@ from ...schemas.quantities import MOST_DURATION_S
 from .soundness import require_sound, require_sound_files
 
 DATASET_FORMATS: tuple[ExportFormat, ...] = ("lerobot", "bop", "nerfstudio", "rerun")
-MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "urdf", "usd", "ply", "colmap", "glb")
-SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "usd": ".usda", "glb": ".glb", "rerun": ".rrd"}
+MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "urdf", "usd", "ply", "colmap", "glb", "mesh")
+SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "usd": ".usda", "glb": ".glb", "mesh": ".glb", "rerun": ".rrd"}
 """Suffixes of the formats that are single files."""
 LEAST_DURATION_S = 0.02
 """Shortest motion that is compared with MuJoCo [s]: two of its frames."""
@@ -49,6 +50,7 @@ NERFSTUDIO_NOTE = (
     "--auto-scale-poses False"
 )
 RERUN_NOTE = "pictures are JPEG and depth has steps of 1 mm; distortion of cameras, forces and parameters are left out"
+MESH_NOTE = "the meshes are the surfaces of the collision spheres, in the colours of the nearest visual spheres"
 NO_TURNING = "in the .ply and .glb the bodies keep the light of the photos, whatever their orientation"
 NO_START = "the model has jointed bodies: the MJCF has no start, and no motion of it was compared, only places of links"
 URDF_NOTE = "a URDF has no contact law and no pose of what moves freely; each body and each jointed body has a file"
@@ -101,6 +103,7 @@ OPTIONS: dict[ExportFormat, tuple[str, ...]] = {
     "ply": ("sh_degree",),
     "colmap": ("capture",),
     "glb": (),
+    "mesh": (),
 }
 """Options that each format takes."""
 
@@ -117,6 +120,7 @@ _KINDS: dict[ExportFormat, DirectoryKind | FileKind] = {
     "ply": "splat file",
     "colmap": "COLMAP model",
     "glb": "glTF file",
+    "mesh": "glTF file",
 }
 """What each format writes; `ply` without that suffix writes a folder."""
 
@@ -128,7 +132,7 @@ def export(
     """Write a dataset or a model in another format.
 
     Args:
-        thing: DATASET for lerobot, bop, nerfstudio and rerun; MODEL for mjcf, urdf, usd, ply, colmap and glb.
+        thing: DATASET for lerobot, bop, nerfstudio and rerun; MODEL for mjcf, urdf, usd, ply, colmap, glb and mesh.
         format_: The format.
         out: The file (.xml, .usda, .glb, .ply, .rrd) or directory to write; it appears once it is complete.
         options: Options of the format.
@@ -270,7 +274,7 @@ def _surfaces_of_bodies(model: Model) -> dict[str, ObjectModel]:
     return {
         body.name: object_model(model, body.name)
         for body in progress(model.file.bodies, "export: meshes", unit="body")
-        if len(model.collision[body.name])
+        if body.name in model.collision and len(model.collision[body.name])
     }
 
 
@@ -286,6 +290,18 @@ def _glb(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tup
     model = _visible(thing)
     counts = write_glb(out, model, overwrite)
     return {f"{name}_spheres": count for name, count in counts.items()}, _light_notes(model)
+
+
+def _mesh(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    model = read_model(thing)
+    surfaces = _surfaces_of_bodies(model)
+    if not surfaces:
+        todo = "fit it to photos: cgwm fit CAPTURE --out MODEL."
+        raise InputDataError(f"{thing}: no body has collision spheres, whose surface the mesh is.", todo=todo)
+    counts = write_mesh_glb(out, model, surfaces, overwrite)
+    grey = [name for name in surfaces if name not in model.body_splats]
+    notes = [f"{name} is grey: it has no visual spheres" for name in grey]
+    return {f"{name}_triangles": count for name, count in counts.items()}, [MESH_NOTE, *notes, *_light_notes(model)]
 
 
 def _colmap(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
@@ -359,4 +375,5 @@ _WORK: dict[ExportFormat, Callable[[Path, Path, ExportOptions, bool], tuple[Fact
     "ply": _ply,
     "colmap": _colmap,
     "glb": _glb,
+    "mesh": _mesh,
 }

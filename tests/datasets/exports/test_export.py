@@ -33,7 +33,15 @@ from cgwm.datasets.rollouts.loader import RolloutReader
 from cgwm.datasets.shapes.meshes import Mesh, mass_properties
 from cgwm.datasets.shapes.ply import SH_C0, Splats, read_splats
 from cgwm.pipeline.export.mujoco_check import _commanded, keyframe_of, resimulate, start_of
-from cgwm.pipeline.export.stage import DATASET_FORMATS, MODEL_FORMATS, OPTIONS, ExportOptions, export, object_model
+from cgwm.pipeline.export.stage import (
+    DATASET_FORMATS,
+    MODEL_FORMATS,
+    OPTIONS,
+    SUFFIXES,
+    ExportOptions,
+    export,
+    object_model,
+)
 from cgwm.pipeline.geometry.isosurface import union_mesh
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.pipeline.validate import validate
@@ -760,5 +768,5 @@ def test_a_model_with_a_singular_camera_is_refused(model: Path, tmp_path: Path, 
     cameras["images"]["b.png"]["T_world_cam"][1] = [0, 0, 0, 0]
     (copy / "cameras.json").write_text(json.dumps(cameras))
     with pytest.raises(InputDataError, match=r"cameras\.json: image 'b\.png': the pose is no rotation and translation"):
-        export(copy, format_, tmp_path / f"out{ {'mjcf': '.xml', 'glb': '.glb', 'usd': '.usda'}.get(format_, '') }")
+        export(copy, format_, tmp_path / f"out{SUFFIXES.get(format_, '')}")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model"]
