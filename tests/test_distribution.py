@@ -3,15 +3,36 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+CONDA = {"torch": "pytorch", "mujoco": "mujoco-python", "opencv-python-headless": "py-opencv"}
+
+
+def test_the_conda_recipe_asks_for_what_the_project_asks_for() -> None:
+    recipe = (ROOT / "packaging/conda/recipe.yaml").read_text(encoding="utf-8")
+    for requirement in PROJECT["project"]["dependencies"]:
+        name, bounds = re.fullmatch(r"([A-Za-z0-9.-]+)([^;]*)(?:;.*)?", requirement).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        if name != "cuda-core":  # optional: without it a GPU renders with torch
+            assert f"    - {CONDA.get(name, name)} {bounds.strip()}\n" in recipe, requirement
+    assert f'version: "{PROJECT["project"]["version"]}"' in recipe
+
+
+def test_the_dockerfile_copies_every_package() -> None:
+    text = (ROOT / "packaging/Dockerfile").read_text(encoding="utf-8")
+    for folder in PROJECT["tool"]["setuptools"]["package-dir"].values():
+        assert f"COPY {folder} /source/{folder}\n" in text
+    assert set(PROJECT["project"]["optional-dependencies"]) >= {"view", "heif"}
 
 
 def _run(*words: str | Path, **options: object) -> str:
