@@ -66,7 +66,7 @@ def _frames(tables: RunTables) -> list[int]:
 
 def _picture(found: TaskWorld, tables: RunTables, device: str) -> Callable[[int], tuple[Image, Image]]:
     """Return a function that draws plant and prediction, each (H, W, 3), at the number of a command."""
-    renderer = FrameRenderer(_visible(found), _camera(found, tables), device)
+    renderer = FrameRenderer(visible_model(found), _camera(found, tables), device)
     time = tables.arrays["control/time"]
 
     def drawn(pose: Array, finger: Array) -> Image:
@@ -100,7 +100,7 @@ def predicted_at(tables: RunTables, now_s: float) -> tuple[Array, Array] | None:
     return pose, finger
 
 
-def _visible(found: TaskWorld) -> Model:
+def visible_model(found: TaskWorld) -> Model:
     """Return the model with a picture of the finger, and of the goal as a mark on the ground."""
     model, robot = found.model, found.task.robot
     splats = dict(model.body_splats)

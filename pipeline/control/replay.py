@@ -12,7 +12,7 @@ from ...datasets.rollouts.control_file import RunTables, read_runs
 from ...datasets.rollouts.replay import Replay
 from ...schemas import HAND_FORMAT, ControlResult, ControlTask, InputDataError, parse, read_json
 from ...schemas.documents import parse_json
-from .film import AHEAD_S, predicted_at
+from .film import AHEAD_S, predicted_at, visible_model
 from .horizon import Array
 from .task_world import TaskWorld, task_world
 
@@ -46,7 +46,8 @@ def replays_of(model: Path, run: Path) -> tuple[Model, dict[str, Replay]]:
             motions[f"seed {one.seed}, predicted {AHEAD_S:g} s before"] = _predicted(found, one)
     if not motions:
         raise InputDataError(f"{run}: no run has a command.", "runs with commands.")
-    return found.model, motions
+    seen = found.world.body_names[found.object] in found.model.body_splats
+    return visible_model(found) if seen else found.model, motions
 
 
 def _plant(found: TaskWorld, run: RunTables) -> Replay:
