@@ -213,7 +213,7 @@ def _trials(descent: Descent, policy: Policy, rows: Rows) -> _Trials:
     points, dampings, sizes = [], [], [torch.zeros_like(descent.cost[rows.groups])]
     for factor in policy.factors:
         damping = factor * descent.damping[rows.groups]
-        reduced = normal.eliminated(damping[rows.owner] if policy.damp_states else None)
+        reduced = normal.eliminated(damping[rows.owner] if policy.damp_states else None, problem.damping_unit)
         step = _step(reduced, here.values, box, damping, rows)
         for share in policy.shares:
             values = box.clamped(here.values + share * step)

@@ -238,11 +238,12 @@ class NormalEquations:
             cost=self.cost,
         )
 
-    def eliminated(self, damping: Tensor | None = None) -> Eliminated:
+    def eliminated(self, damping: Tensor | None = None, unit: Tensor | None = None) -> Eliminated:
         """Eliminate the states by the Schur complement.
 
         Args:
-            damping: Relative damping of the states of each item, shape (B,); none by default.
+            damping: Damping of the states of each item, shape (B,); none by default.
+            unit: What it multiplies, see `damped`.
         """
         if not self.states.shape[-1]:
             return Eliminated(
@@ -250,7 +251,7 @@ class NormalEquations:
             )
         states = self.states
         if damping is not None:
-            states = damped(states, damping)
+            states = damped(states, damping, unit)
         found = solved(states, torch.cat((self.mixed, self.state_slope[..., None]), -1))
         by_parameter, state_step = found[..., :-1], found[..., -1]
         return Eliminated(
@@ -265,9 +266,16 @@ class NormalEquations:
         return self.state_slope.isfinite().all(-1) & self.slope.isfinite().all(-1)
 
 
-def damped(matrix: Tensor, damping: Tensor) -> Tensor:
-    """Return matrices (B, N, N) with their diagonals, at least `FLOOR`, raised by relative dampings (B,)."""
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(FLOOR)
+def damped(matrix: Tensor, damping: Tensor, unit: Tensor | None = None) -> Tensor:
+    """Return matrices (B, N, N) with dampings (B,) added to their diagonals.
+
+    Args:
+        matrix: The matrices.
+        damping: The dampings.
+        unit: What they multiply, shape (N,) (Levenberg, 1944); by default the diagonal itself, at least `FLOOR`
+            (Marquardt, 1963).
+    """
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(FLOOR) if unit is None else unit
     return matrix + torch.diag_embed(damping[:, None] * diagonal)
 
 
@@ -288,6 +296,8 @@ class Problem(ABC):
     """Group of each item, shape (B,)."""
     units: Tensor | None = None
     """Unit of each coordinate of a state's step for the policy's limits, shape (S,)."""
+    damping_unit: Tensor | None = None
+    """What the damping of states multiplies, shape (S,); by default the diagonal of their information."""
     derivatives_with_costs: bool = False
     """Whether derivatives are computed at every trial, because they cost little more than the cost alone."""
 

@@ -6,14 +6,17 @@ their start, so derivatives are differences over one standard deviation of it, n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..optimization.least_squares import Policy, descend
 from ..optimization.levenberg_marquardt import robust_loss
+from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..physics.world import World
 from .observations import Observations
 from .residuals import STATE_SIZE, TrajectoryResiduals
@@ -23,6 +26,17 @@ MAX_STEP = (0.005, 0.05, 0.1, 0.5)
 """Largest differences in position [m], rotation [rad], velocity [m/s], omega [rad/s], where nothing was measured."""
 DAMPINGS = (0.01, 0.1, 1.0, 10.0, 100.0)
 """Levenberg-Marquardt dampings, tried in parallel, in units of the warm-up's information."""
+POLICY = Policy(
+    iterations=3,
+    attempts=1,
+    damping=1.0,
+    down=1.0,
+    least_damping=1.0,
+    most_damping=math.inf,
+    factors=DAMPINGS,
+    linearise_end=False,
+)
+"""A fit ends where none of the dampings lowers the distance."""
 ROBUST_SCALE = 3.0
 """Scale of the Cauchy loss, in sigmas."""
 MAX_ITEMS = 128
@@ -57,71 +71,88 @@ class StartUncertainty:
             ]
         )
         changes = torch.as_tensor(normal).to(self.covariance) @ covariance_root(self.covariance).transpose(1, 2)
-        rows = self._rows(torch.cat((torch.zeros_like(changes[:, :1]), changes), 1))[..., :3]
-        return self._distance(rows[:, 1:] - rows[:, :1]).mean(1)
+        items = torch.arange(len(changes))
+        rows = self.rows(torch.cat((torch.zeros_like(changes[:, :1]), changes), 1), items)[..., :3]
+        return self.distance(rows[:, 1:] - rows[:, :1], items).mean(1)
 
     def fit(self, noise: Noise, iterations: int) -> Tensor:
         """Return the mean distance (B,) [m] to the measured track after fitting the state to all of it.
 
         Gauss-Newton steps with Cauchy weights in the coordinates in which the start's covariance is the identity, with
         several dampings in parallel; a state is kept only where it lowers the distance, so the result never exceeds
-        that of the start. The loop is its own, because it lowers the distance and not the sum that it linearises.
+        that of the start.
 
         Args:
             noise: Standard deviations of the measurement (position [m], rotation [rad]).
             iterations: Number of steps.
         """
-        root = _limited(covariance_root(self.covariance))
-        directions = root.transpose(1, 2)  # row k: one standard deviation along the k-th coordinate
-        best = torch.zeros_like(directions[:, :1])
-        rows = self._rows(best)
-        distance = self._distance(rows)
-        for _ in range(iterations):
-            moved = self._rows(best + directions)
-            jacobian = moved - rows
-            steps = self._steps(rows[:, 0], jacobian, noise)
-            candidates = torch.cat((best, best + steps @ directions), 1)
-            all_rows = torch.cat((rows, self._rows(candidates[:, 1:])), 1)
-            distances = self._distance(all_rows)
-            choice = distances.argmin(1)
-            item = torch.arange(len(choice))
-            best, rows = candidates[item, choice][:, None], all_rows[item, choice][:, None]
-            distance = distances[item, choice][:, None]
-        return distance[:, 0]
+        problem = _StartFit(self, noise)
+        return descend(problem, problem.start(), replace(POLICY, iterations=iterations)).cost
 
-    def _steps(self, rows: Tensor, jacobian: Tensor, noise: Noise) -> Tensor:
-        """Return the damped steps (B, dampings, S) of residuals (B, F, 6) and differences (B, S, F, 6)."""
-        counted = self.weight.flatten(1)[..., None].expand(-1, -1, 6)
-        scale = torch.cat([_spread(rows[..., k : k + 3], noise[k // 3]) for k in (0, 3)], -1)[:, None] / counted
-        scaled, slopes = rows / scale, jacobian / scale[:, None]
-        _, weight = robust_loss(scaled.square().sum(-1), ROBUST_SCALE)
-        flat = torch.nan_to_num(slopes.flatten(2), posinf=0.0, neginf=0.0)
-        weighted = flat * weight.repeat_interleave(6, -1)[:, None]
-        normal = weighted @ flat.transpose(1, 2)
-        gradient = -(weighted @ torch.nan_to_num(scaled).flatten(1)[..., None])
-        eye = torch.eye(normal.shape[-1]).to(normal)
-        return torch.stack([torch.linalg.solve(normal + d * eye, gradient).squeeze(-1) for d in DAMPINGS], 1)
-
-    def _rows(self, changes: Tensor) -> Tensor:
-        """Return residuals (B, K, F, 6) in metres and radians of state changes (B, K, S)."""
+    def rows(self, changes: Tensor, items: Tensor) -> Tensor:
+        """Return residuals (b, K, F, 6) in metres and radians of state changes (b, K, S) of some episodes (b,)."""
         batch, count, size = changes.shape
-        items = [item for item in range(batch) for _ in range(count)]
+        every = items.repeat_interleave(count).tolist()
         flat = changes.reshape(-1, size)
         parts = []
-        for first in range(0, len(items), MAX_ITEMS):
-            chosen = self.observations.select(items[first : first + MAX_ITEMS])
+        for first in range(0, len(every), MAX_ITEMS):
+            chosen = self.observations.select(every[first : first + MAX_ITEMS])
             residuals = TrajectoryResiduals(
                 world=self.world, parameters=[], observations=chosen, position_std_m=1.0, rotation_std_rad=1.0
             )
             parts.append(residuals(flat.new_zeros(0), flat[first : first + MAX_ITEMS], False)[0])
         return torch.cat(parts).unflatten(0, (batch, count))
 
-    def _distance(self, rows: Tensor) -> Tensor:
-        """Return the mean distance (B, K) [m] over the frames that count; infinite where a rollout diverged."""
-        weight = self.weight.flatten(1)[:, None]
+    def distance(self, rows: Tensor, items: Tensor) -> Tensor:
+        """Return the mean distance (b, K) [m] over the frames that count; infinite where a rollout diverged."""
+        weight = self.weight.flatten(1)[items][:, None]
         distance = rows[..., :3].square().sum(-1).sqrt()
         mean = (distance * weight).sum(-1) / weight.sum(-1)
         return torch.nan_to_num(mean, nan=torch.inf, posinf=torch.inf)
+
+
+class _StartFit(Problem):
+    """Starts of episodes (B), fitted to their whole tracks; the cost is the distance and not the sum of squares.
+
+    Args:
+        uncertainty: The episodes, with the covariance of their starts.
+        noise: Standard deviations of the measurement.
+    """
+
+    def __init__(self, uncertainty: StartUncertainty, noise: Noise) -> None:
+        self.uncertainty, self.noise = uncertainty, noise
+        root = _limited(covariance_root(uncertainty.covariance))
+        self.directions = root.transpose(1, 2)  # row k: one standard deviation along the k-th coordinate
+        self.owner = torch.arange(len(root), device=root.device)
+        self.box = Box.unbounded(root.new_zeros(len(root), 0))
+        self.damping_unit = root.new_ones(root.shape[-1])  # the information of the warm-up
+
+    def start(self) -> Point:
+        """Return the starts of the warm-up."""
+        return Point(values=self.directions.new_zeros(len(self.owner), 0), states=(self.directions[:, 0] * 0.0,))
+
+    def costs(self, point: Point, rows: Rows) -> Tensor:
+        """Return the distance (b,) [m] of each episode."""
+        changes = (point.states[0][:, None] @ self.directions[rows.items])[:, :1]
+        return self.uncertainty.distance(self.uncertainty.rows(changes, rows.items), rows.items)[:, 0]
+
+    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+        """Return the normal equations of residuals and of their differences over one standard deviation."""
+        directions = self.directions[rows.items]
+        here = point.states[0][:, None] @ directions
+        every = self.uncertainty.rows(torch.cat((here, here + directions), 1), rows.items)
+        counted = self.uncertainty.weight.flatten(1)[rows.items][..., None].expand(-1, -1, 6)
+        found, jacobian = every[:, 0], every[:, 1:] - every[:, :1]
+        scale = torch.cat([_spread(found[..., k : k + 3], self.noise[k // 3]) for k in (0, 3)], -1)[:, None] / counted
+        scaled, slopes = found / scale, jacobian / scale[:, None]
+        _, weight = robust_loss(scaled.square().sum(-1), ROBUST_SCALE)
+        return NormalEquations.of_rows(
+            torch.nan_to_num(scaled).flatten(1),
+            torch.nan_to_num(slopes.flatten(2), posinf=0.0, neginf=0.0).mT,
+            0,
+            self.uncertainty.distance(every[:, :1], rows.items)[:, 0],
+            weight.repeat_interleave(6, -1),
+        )
 
 
 def covariance_root(covariance: Tensor) -> Tensor:

@@ -185,6 +185,7 @@ TRACK_NUMERICS = {
         "flight_noise.MOST_CORRELATED",
         "state_uncertainty.MAX_STEP",
         "state_uncertainty.DAMPINGS",
+        "state_uncertainty.POLICY",
         "state_uncertainty.ROBUST_SCALE",
         "residuals.SMOOTH_STEPS",
         "residuals.STATE_STEPS",

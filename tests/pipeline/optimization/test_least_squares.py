@@ -5,7 +5,7 @@ import pytest
 import torch
 from cgwm.pipeline.optimization.least_squares import Descent, Policy, Stop, descend
 from cgwm.pipeline.optimization.levenberg_marquardt import minimise
-from cgwm.pipeline.optimization.problem import Box, NormalEquations, Point, Problem, Rows
+from cgwm.pipeline.optimization.problem import FLOOR, Box, NormalEquations, Point, Problem, Rows
 from torch import Tensor
 from torch.func import jacfwd, vmap
 
@@ -151,6 +151,20 @@ def test_a_weight_of_an_item_changes_no_step_of_its_state() -> None:
     plain, heavy = normal.eliminated(), normal.weighted(weight).eliminated()
     assert torch.allclose(plain.state_step, heavy.state_step)
     assert torch.allclose(weight[:, None] * plain.score, heavy.score)
+
+
+def test_damping_multiplies_the_diagonal_or_units() -> None:
+    """Marquardt's and Levenberg's: damping 2 of a diagonal of 9 and 0, and of units 1 and 4."""
+    normal = NormalEquations(
+        states=tensor([[[9.0, 0.0], [0.0, 0.0]]]),
+        mixed=torch.zeros(1, 2, 0, dtype=F64),
+        information=torch.zeros(1, 0, 0, dtype=F64),
+        state_slope=tensor([[27.0, 16.0]]),
+        slope=torch.zeros(1, 0, dtype=F64),
+        cost=tensor([1.0]),
+    )
+    assert normal.eliminated(tensor([2.0])).state_step[0].tolist() == pytest.approx([1.0, 16.0 / (2 * FLOOR)])
+    assert normal.eliminated(tensor([2.0]), tensor([1.0, 4.0])).state_step[0].tolist() == pytest.approx([27 / 11, 2.0])
 
 
 def test_outliers_have_no_influence_with_cauchys_loss() -> None:
