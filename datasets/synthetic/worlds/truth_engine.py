@@ -71,7 +71,7 @@ def simulate(plan: WorldPlan, model: MjModel, episode: WorldEpisode, rate_hz: in
 
 
 class _Friction:
-    """Time constants of slip of all pairs, set before each step by the speed of their first body.
+    """Time constants of slip of all pairs, set before each step by the speed of their body, of two by the later one's.
 
     A fast constant that friction cannot meet would lift a sliding body, see `synthetic/friction.py`; a slow one would
     let it creep at rest. A ball rolls, so that its friction holds.
@@ -79,7 +79,8 @@ class _Friction:
 
     def __init__(self, plan: WorldPlan, model: MjModel) -> None:
         self._model = model
-        bodies = model.geom_bodyid[model.pair_geom1]
+        # of a body and a surface, MuJoCo may list the surface first
+        bodies = np.maximum(model.geom_bodyid[model.pair_geom1], model.geom_bodyid[model.pair_geom2])
         self._body = bodies - model.body(plan.things[0].name).id
         self._rolls = np.array([plan.things[k].radius_m is not None for k in self._body])
         self._limit = EXCESS * GRAVITY_M_S2 * model.pair_friction[:, 0]

@@ -11,7 +11,7 @@ from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.surface_distance import surface_distance
 from cgwm.datasets.synthetic.worlds import WORLDS, make_world, plan_world
 from cgwm.datasets.synthetic.worlds.bin import INSIDE_M
-from cgwm.datasets.synthetic.worlds.ramp import SLOPE_DEG
+from cgwm.datasets.synthetic.worlds.ramp import BALL_M, BLOCK_M, SLOPE_DEG
 from cgwm.datasets.synthetic.worlds.record import record
 from cgwm.datasets.synthetic.worlds.truth_engine import build_model, picture, simulate
 from cgwm.schemas import Surface, UsageError
@@ -26,6 +26,17 @@ def test_on_the_ramp_the_block_slides_and_the_ball_rolls() -> None:
     for body, wanted in ((0, math.sin(slope) - mu * math.cos(slope)), (1, 5 / 7 * math.sin(slope))):
         rate = 2 * np.polyfit(times, poses[12:, body, :3] @ down, 2)[0]
         assert rate == pytest.approx(9.81 * wanted, rel=0.02)
+
+
+def test_on_the_floor_the_block_slides_by_the_friction_that_is_stated_and_is_not_lifted() -> None:
+    plan = plan_world("ramp", 0)
+    place, speed = plan.episodes[0].qpos.copy(), np.zeros((2, 6))
+    place[0], place[1, :3], speed[0, 0] = [0.3, 0.3, BLOCK_M[2], 1, 0, 0, 0], [1.0, -0.5, BALL_M], 0.8
+    start = replace(plan.episodes[0], qpos=place, qvel=speed, length_s=0.12)
+    poses = simulate(plan, build_model(plan), start, 120)[:, 0]
+    rate = 2 * np.polyfit(np.arange(len(poses))[2:] / 120, poses[2:, 0], 2)[0]
+    assert rate == pytest.approx(-9.81 * plan.contact.friction["plastic", "rubber"], rel=2e-3)
+    assert np.abs(poses[:, 2] - BLOCK_M[2]).max() < 5e-5
 
 
 def test_the_bin_holds_its_objects_and_they_come_to_rest() -> None:
