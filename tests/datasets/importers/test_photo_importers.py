@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -19,11 +20,13 @@ from cgwm.datasets import (
     read_rgb,
     write_image,
 )
+from cgwm.datasets.capture.transforms import read_transforms
 from cgwm.datasets.importers.recordings import Units
 from cgwm.datasets.importers.walk_video import FrameFigures, choose
 from cgwm.datasets.synthetic.rig import look_at
 from cgwm.schemas import InputDataError
 
+ROOT = Path(__file__).resolve().parents[3]
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 POINT = np.array([0.1, -0.05, 0.2])
@@ -198,6 +201,15 @@ def test_transforms_json_keeps_its_pixels(tmp_path: Path, names: list[str]) -> N
     result = import_nerfstudio(folder, tmp_path / "out")
     assert result.posed and "unscaled" in result.warnings[0]
     _require_cameras(tmp_path / "out", expected, metric=False)
+
+
+def test_the_fox_of_instant_ngp_keeps_its_cameras(tmp_path: Path) -> None:
+    folder = Path(os.environ.get("CGWM_SHARED_DATA", ROOT.parent / "shared" / "data")) / "fox"
+    if not folder.is_dir():
+        pytest.skip("no measured photos: set CGWM_SHARED_DATA to the folder that holds fox/")
+    assert import_nerfstudio(folder, tmp_path / "out").photos == 50
+    found, there = Capture.open(tmp_path / "out").cameras, read_transforms(folder / "transforms.json")
+    assert found is not None and found.images == there.images and found.cameras == there.cameras
 
 
 def test_a_unit_makes_the_poses_metric(tmp_path: Path) -> None:
