@@ -17,11 +17,14 @@ from typing import Any
 import numpy as np
 import pytest
 from cgwm.datasets.exports.selection import Selection
-from cgwm.datasets.models.model import read_model
+from cgwm.datasets.models.model import read_model, write_model
+from cgwm.datasets.rollouts.control_file import read_runs
 from cgwm.datasets.rollouts.dataset import read_manifest
 from cgwm.datasets.rollouts.loader import RolloutReader
+from cgwm.pipeline.control import control
 from cgwm.pipeline.synthesize import synthesize
-from cgwm.schemas import SynthesizeConfig
+from cgwm.schemas import SynthesizeConfig, task_toml
+from helpers.pushing import push_task, pushed_model
 from helpers.small_model import write_small_model
 
 READERS = Path(__file__).with_name("readers")
@@ -169,6 +172,21 @@ def test_robomimic_reads_the_shard_as_it_is(environment: Environment, work: Path
             np.testing.assert_array_equal(arrays[f"{item}/next_obs/{name}"], master[frames + 1])
         np.testing.assert_array_equal(arrays[f"{item}/actions"], reader.read(0, "actions")[frames])
     reader.close()
+
+
+def test_robomimic_reads_runs_of_control(environment: Environment, work: Path) -> None:
+    python = environment("robomimic", ROBOMIMIC_WHOLE, ("robomimic==0.3.0",), (f"torch=={pinned('torch')}",))
+    write_model(work / "cube", pushed_model(visible=False))
+    easy = push_task(goal={"position_m": [0.1, 0.0]}, success={"timeout_s": 0.3})
+    (work / "push.toml").write_text(task_toml(easy))
+    control(work / "cube", work / "push.toml", work / "run", clock="ideal", seeds=2)
+    found = read_by(python, "robomimic_runs", work, work / "run" / "run.h5", "object,finger")
+    arrays = read_runs(work / "run" / "run.h5")[0].arrays
+    count = len(arrays["actions"])
+    assert found["None"]["demos"] == ["demo_0", "demo_1"] and found["None"]["sequences"] == 2 * count
+    assert found["None"]["shapes"] == {"object": [3, 7], "finger": [3, 2]}
+    np.testing.assert_allclose(found["None"]["next_object"], arrays["next_obs/object"][1:4, :3], rtol=1e-6)
+    assert found["success"] == {"demos": [], "sequences": 0}
 
 
 def test_nerfstudio_reads_the_export(environment: Environment, work: Path) -> None:
