@@ -30,6 +30,8 @@ class HandSection(TaskSection):
     """Orientation of its root link, to world."""
     friction: dict[str, Friction] = {}
     """Friction of the object and single links, by link [1]; by default that of the model."""
+    apart: tuple[str, ...] = ()
+    """Links that the object never touches; predictions without their shapes are faster."""
     corners: Annotated[int, Field(ge=4, le=200)] = 16
     """Largest number of corners of a link's convex shape."""
 
@@ -256,6 +258,7 @@ def require_joints(task: HandTask, known: tuple[str, ...], links: tuple[str, ...
         ("[limits] joints", task.limits.joints, "joint", known),
         ("[start] joints", task.start.joints, "joint", known),
         ("[robot] friction", task.robot.friction, "link", links),
+        ("[robot] apart", task.robot.apart, "link", links),
     )
     for place, names, kind, legal in given:
         for name in names:

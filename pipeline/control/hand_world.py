@@ -128,7 +128,10 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
     _require_servos(task, hand)
     chain, links = chain_of(hand, {link.name: (np.zeros((0, 3)), np.zeros(0)) for link in hand.links}, "fixed",
                             Servo(**task.servo.model_dump()))  # fmt: skip
-    chain, bodies = _shaped(task, chain, links, link_hulls(hand, task.robot.corners))
+    shapes = {
+        name: balls for name, balls in link_hulls(hand, task.robot.corners).items() if name not in task.robot.apart
+    }
+    chain, bodies = _shaped(task, chain, links, shapes)
     world = world_of(model, task, chain, bodies)
     limits = [_limits(task, joint) for joint in chain.moving]
     lower, upper = (np.array(side) for side in zip(*limits, strict=True))
@@ -195,7 +198,7 @@ def _shaped(
     """Return the chain and its links with their shapes; further shapes of a link are links that are fixed to it."""
     bodies, more, joints = [], [], []
     for link in links:
-        first, *others = [_with_hull(link, balls) for balls in shapes[link.name]] or [link]
+        first, *others = [_with_hull(link, balls) for balls in shapes.get(link.name, ())] or [link]
         bodies.append(first)
         for number, part in enumerate(others, 1):
             name = f"{link.name}/{number}"

@@ -94,6 +94,12 @@ def test_the_world_has_the_hand_of_the_file(controller: HandController) -> None:
     assert not controller.slow
 
 
+def test_a_link_that_is_apart_touches_nothing(folder: Path, model: Model) -> None:
+    hand = hand_world(model, hand_task(folder, robot={"apart": ("tip",)}))
+    counts = [body.radii.shape[1] for body in hand.world.bodies]
+    assert counts[:3] == [8, 8, 0] and [hand.world.body_names[k] for k, _ in hand.world.pairs if k != 3] == ["arm"]
+
+
 def test_no_target_exceeds_range_or_speed_whatever_the_noise(controller: HandController) -> None:
     controller.restart(0)
     objective, _ = controller._objective(begun(controller), 0.05)
@@ -203,6 +209,7 @@ def test_printed_tasks_are_read_again(tmp_path: Path) -> None:
         ({"limits": {"joints": {"swnig": (0, 1)}}}, "the hand has no joint 'swnig'; .* Did you mean 'swing'?"),
         ({"start": {"joints": {"swing": 2.0}}}, "'swing' = 2 rad"),
         ({"robot": {"friction": {"thumb": 0.3}}}, "the hand has no link 'thumb'"),
+        ({"robot": {"apart": ("tap",)}}, "the hand has no link 'tap'; .* Did you mean 'tip'?"),
         ({"start": {"position_m": (-0.03, 0.0, 0.035)}}, "the start: .*inside"),
         ({"goal": {"position_m": (-0.03, 0.0, 0.035)}}, "position_m: .*inside"),
         ({"robot": {"file": "nothing.xml"}}, r"task\.toml: \[robot\] file: .*nothing\.xml"),
