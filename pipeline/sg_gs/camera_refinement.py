@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.spheres import Spheres
+from ..optimization.adam import Adam
 from ..rendering.image_metrics import photometric
 from ..runtime.checkpoint import State
 from .photo_exposure import least_squares_gain
@@ -37,7 +38,7 @@ class Motions:
     def __init__(self, views: Sequence[View], spread: float) -> None:
         self._spread = spread
         self._twists = {view.name: view.image.new_zeros(6, requires_grad=True) for view in views}
-        self._adam = torch.optim.Adam(list(self._twists.values()), RATE)
+        self._adam = Adam([{"params": list(self._twists.values()), "lr": RATE}])
 
     def moved(self, view: View) -> View:
         """Return a photo with the current pose of its camera, differentiable; the field `camera` stays."""
@@ -51,7 +52,7 @@ class Motions:
         """Move the cameras whose photos were rendered, when `share` of the fit is over."""
         self._adam.param_groups[0]["lr"] = 0.0 if share < WAITING else RATE * (LAST_RATE / RATE) ** share
         self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+        self._adam.zero_grad()
 
     @torch.no_grad()
     def found(self, views: Sequence[View]) -> dict[str, Tensor]:
@@ -86,15 +87,14 @@ def find_motion(spheres: Spheres, view: View, weight: Tensor, spread: float) -> 
         spread: Size of the cameras' arrangement [m].
     """
     twist = view.image.new_zeros(6, requires_grad=True)
-    optimiser = torch.optim.Adam([twist], _SINGLE_RATE)
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimiser, (LAST_RATE / _SINGLE_RATE) ** (1 / _SINGLE_STEPS))
+    optimiser = Adam([{"params": [twist], "lr": _SINGLE_RATE}])
     for _ in range(_SINGLE_STEPS):
         picture = render_view(spheres, moved(view, _motion(twist, spread))).features[0]
         picture = picture * least_squares_gain(picture.detach(), view.image, weight)
         optimiser.zero_grad()
         (photometric(picture, view.image, weight) + _prior(twist)).backward()
         optimiser.step()
-        decay.step()
+        optimiser.decay((LAST_RATE / _SINGLE_RATE) ** (1 / _SINGLE_STEPS))
     return _motion(twist.detach(), spread)
 
 

@@ -18,6 +18,7 @@ from ...datasets.io.progress import progress
 from ...datasets.shapes.ply import SH_C0
 from ..geometry.spheres import Spheres
 from ..geometry.spherical_harmonics import term_count
+from ..optimization.adam import Adam
 from ..rendering.image_metrics import psnr_of
 from ..runtime.checkpoint import Slot, State
 from .camera_refinement import Motions
@@ -74,7 +75,7 @@ class Population:
         }
         self._values = {name: value.detach().clone().requires_grad_() for name, value in start.items()}
         self._adam = {
-            name: torch.optim.Adam([value], self._rate(name), eps=1e-15, fused=value.is_cuda)
+            name: Adam([{"params": [value], "lr": self._rate(name)}], eps=1e-15, fused=value.is_cuda)
             for name, value in self._values.items()
             if value.numel()
         }
@@ -115,7 +116,7 @@ class Population:
         self._adam["means"].param_groups[0]["lr"] = rate
         for adam in self._adam.values():
             adam.step()
-            adam.zero_grad(set_to_none=True)
+            adam.zero_grad()
         with torch.no_grad():
             faint = torch.sigmoid(100 * (DEAD - torch.sigmoid(self._values["logits"])))
             reach = self._values["log_scales"].exp().square() * faint * NOISE * rate

@@ -11,6 +11,7 @@ from torch import Tensor
 from ...datasets.io.progress import progress
 from ...schemas import NotConvergedError
 from ..geometry.spheres import Spheres
+from ..optimization.adam import Adam
 from ..rendering.image_metrics import psnr_of
 from ..runtime.checkpoint import Slot, State
 from .camera_refinement import Motions
@@ -155,8 +156,8 @@ class _Run:
     ) -> None:
         self.trainable, self.exposures, self.motions = trainable, exposures, motions
         self.generator = torch.Generator().manual_seed(seed)
-        self.adam = torch.optim.Adam(trainable.groups, eps=1e-12)
-        self.decay = torch.optim.lr_scheduler.ExponentialLR(self.adam, 0.1 ** (1 / max(iterations, 1)))
+        self.adam = Adam(trainable.groups, eps=1e-12)
+        self.decay = 0.1 ** (1 / max(iterations, 1))
         self.losses: list[Tensor] = []
         self.order: list[int] = []
 
@@ -171,7 +172,7 @@ class _Run:
         self.adam.zero_grad()
         value.backward()
         self.adam.step()
-        self.decay.step()
+        self.adam.decay(self.decay)
         if self.motions is not None:
             self.motions.step(share)
         self.losses.append(value.detach())
@@ -181,7 +182,6 @@ class _Run:
         return {
             "spheres": self.trainable.state(),
             "adam": self.adam.state_dict(),
-            "decay": self.decay.state_dict(),
             "generator": self.generator.get_state(),
             "losses": torch.stack(self.losses),
             "order": self.order,
@@ -196,7 +196,6 @@ class _Run:
             return 0
         self.trainable.restore(state["spheres"])
         self.adam.load_state_dict(state["adam"])
-        self.decay.load_state_dict(state["decay"])
         self.generator.set_state(state["generator"].cpu())
         self.losses, self.order = list(state["losses"].unbind()), state["order"]
         for learned, name in ((self.exposures, "exposures"), (self.motions, "motions")):

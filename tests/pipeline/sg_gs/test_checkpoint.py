@@ -11,6 +11,7 @@ import pytest
 import torch
 from cgwm.datasets.models.fit_inputs import photo_inputs
 from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.optimization.adam import Adam
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
 from cgwm.pipeline.sg_gs import bodies, mcmc
 from cgwm.pipeline.sg_gs import optimize as descents
@@ -38,7 +39,7 @@ def capture(tmp_path_factory):
 
 
 def test_a_state_comes_back_as_it_was(tmp_path):
-    optimiser = torch.optim.Adam([torch.ones(3, requires_grad=True)])
+    optimiser = Adam([{"params": [torch.ones(3, requires_grad=True)], "lr": 1e-3}])
     optimiser.param_groups[0]["params"][0].sum().backward()
     optimiser.step()
     state = {"adam": optimiser.state_dict(), "order": [3, 1], "rate": 0.1, "random": torch.Generator().get_state()}
