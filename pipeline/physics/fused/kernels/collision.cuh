@@ -201,20 +201,62 @@ INLINE int flat_face(const Problem& problem, const Environment& env, int b, cons
     return face;
 }
 
+const int NEAR_ROOM = 32;
+struct Near {  // edges of a hull that are near another one; all of them where more are than there is room for
+    int count, listed[NEAR_ROOM];
+    INLINE int many(int ridges) const { return count < 0 ? ridges : count; }
+    INLINE int edge(int i) const { return count < 0 ? i : listed[i]; }
+    INLINE void add(int edge) {
+        if (count == NEAR_ROOM) count = -1;
+        if (count >= 0) listed[count++] = edge;
+    }
+    INLINE bool has(int edge) const {
+        bool found = count < 0;
+        for (int i = 0; i < count; i++) found = found || listed[i] == edge;
+        return found;
+    }
+};
+
 struct Parting {  // how two hulls part best
     int on_a, on_b;  // faces that lie flat on each other, -1 for none: parallel to the face that parts them best
-    Number axis[3];       // normal of a face or of two edges along which the gap is largest, out of a
-    Number gap;           // no point of one hull is nearer to the other one
+    Number axis[3];  // normal of a face or of two edges along which the gap is largest, out of a
+    Number gap;      // no point of one hull is nearer to the other one
+    Mat turn;        // of the frame of b into that of a, with `shift`
+    Vec shift;
+    Near near_a, near_b;
 };
 
 // The edge of body b in the frame of body a.
-INLINE Edge edge_in(const Problem& problem, const Environment& env, int a, int b, const Mat* rotations, int i) {
-    Edge edge = placed_edge(edge_of(hull_of(problem, env, b), i), rotations[b],
-                            env.bodies[b].position - rotations[b] * env.constants[b].com - env.bodies[a].position);
-    Edge turned = {transposed(rotations[a], edge.start) + env.constants[a].com, transposed(rotations[a], edge.along),
-                   transposed(rotations[a], edge.inward), transposed(rotations[a], edge.other_inward), edge.radius,
-                   edge.widening};
-    return turned;
+INLINE Edge edge_in(const Parting& parting, const Hull& hull_b, int i) {
+    return placed_edge(edge_of(hull_b, i), parting.turn, parting.shift);
+}
+
+// Whether an edge is farther than a margin from the box of a body's spheres, all in the frame of that body.
+INLINE bool edge_beside(const Constants& body, Vec start, Vec along, Number margin) {
+    const Number from[3] = {plain(start.x), plain(start.y), plain(start.z)};
+    const Number over[3] = {plain(along.x), plain(along.y), plain(along.z)};
+    for (int k = 0; k < 3; k++) {
+        Number to = from[k] + over[k];
+        if (lesser(from[k], to) > body.high[k] + margin || greater(from[k], to) < body.low[k] - margin) return true;
+    }
+    return false;
+}
+
+// Lists the edges of both hulls that are within a margin of the other body's box.
+INLINE void find_near(const Environment& env, int a, int b, const Hull& hull_a, const Hull& hull_b, Number margin,
+                      Parting& found) {
+    found.near_a.count = found.near_b.count = 0;
+    for (int i = 0; i < hull_a.ridges && found.near_a.count >= 0; i++) {
+        Edge edge = edge_of(hull_a, i);
+        Vec start = transposed(found.turn, edge.start - found.shift), along = transposed(found.turn, edge.along);
+        Number thick = plain(edge.radius) + greater(plain(edge.widening), Number(0));
+        if (!edge_beside(env.constants[b], start, along, margin + thick)) found.near_a.add(i);
+    }
+    for (int j = 0; j < hull_b.ridges && found.near_b.count >= 0; j++) {
+        Edge edge = edge_in(found, hull_b, j);
+        Number thick = plain(edge.radius) + greater(plain(edge.widening), Number(0));
+        if (!edge_beside(env.constants[a], edge.start, edge.along, margin + thick)) found.near_b.add(j);
+    }
 }
 
 // Gap between the hulls of two bodies along a unit vector of the world, out of a.
@@ -237,8 +279,10 @@ INLINE Number gap_along(const Problem& problem, const Environment& env, int a, i
     return -ends[1] - ends[0];
 }
 
-// Finds how the hulls of two bodies part best; false where they are not compared.
-__device__ bool part(const Problem& problem, const Environment& env, int p, const Mat* rotations, Parting& found) {
+// Finds how the hulls of two bodies part best; false where they are not compared. Where a face parts them by more than
+// `limit`, edges are not looked at.
+__device__ bool part(const Problem& problem, const Environment& env, int p, const Mat* rotations, Number limit,
+                     Parting& found) {
     int a = pair_a(p), b = pair_b(p);
     found.on_a = found.on_b = -1;
     if (face_count(a) == 0 || face_count(b) == 0) return false;
@@ -250,14 +294,21 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
     part_by(problem, env, b, a, rotations, Number(-1), found.gap, found.axis);
     found.on_a = flat_face(problem, env, a, rotations[a], Number(1), found.axis);
     found.on_b = flat_face(problem, env, b, rotations[b], Number(-1), found.axis);
-    if (contact_count(p) == sphere_count(a) + sphere_count(b)) return true;
-    Hull hull = hull_of(problem, env, a);
+    if (contact_count(p) == sphere_count(a) + sphere_count(b) || found.gap > limit) return true;
+    const Hull hull_a = hull_of(problem, env, a), hull_b = hull_of(problem, env, b);
+    const Mat &R = rotations[a], &Q = rotations[b];
+    Mat turn = {R.x.x * Q.x + R.y.x * Q.y + R.z.x * Q.z, R.x.y * Q.x + R.y.y * Q.y + R.z.y * Q.z,
+                R.x.z * Q.x + R.y.z * Q.y + R.z.z * Q.z};
+    found.turn = turn;
+    found.shift = transposed(R, env.bodies[b].position - Q * env.constants[b].com - env.bodies[a].position);
+    found.shift = found.shift + env.constants[a].com;
+    find_near(env, a, b, hull_a, hull_b, limit + Number(SMOOTHING_M), found);
     Number most = found.gap;
-    for (int j = 0; j < ridge_count(b); j++) {
-        Edge second = edge_in(problem, env, a, b, rotations, j);
-        for (int i = 0; i < hull.ridges; i++) {
+    for (int n = 0; n < found.near_b.many(hull_b.ridges); n++) {
+        Edge second = edge_in(found, hull_b, found.near_b.edge(n));
+        for (int m = 0; m < found.near_a.many(hull_a.ridges); m++) {
             Crossing crossing;
-            if (!cross_edges(edge_of(hull, i), second, crossing)) continue;
+            if (!cross_edges(edge_of(hull_a, found.near_a.edge(m)), second, crossing)) continue;
             if (crossing.lean > Number(0) || !(plain(crossing.gap) > most)) continue;
             most = plain(crossing.gap);
             Vec normal = rotations[a] * crossing.normal;
@@ -277,7 +328,9 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
 // Finds the contact of one slot of edges: where an edge of a comes over b, or where it leaves it.
 __device__ bool face_edges(const Problem& problem, const Environment& env, int p, int slot, const Mat* rotations,
                            Number limit, const Parting& parting, Facing& facing) {
-    int a = pair_a(p), b = pair_b(p);
+    int a = pair_a(p);
+    if (!parting.near_a.has(slot / 2)) return false;
+    const Hull hull_b = hull_of(problem, env, pair_b(p));
     Edge first = edge_of(hull_of(problem, env, a), slot / 2);
     Vec axis = vec(Real(parting.axis[0]), Real(parting.axis[1]), Real(parting.axis[2]));
     axis = transposed(rotations[a], axis);
@@ -286,9 +339,10 @@ __device__ bool face_edges(const Problem& problem, const Environment& env, int p
     if (along * along > Number(1 - PARALLEL * PARALLEL) * length2) return false;
     Number least = limit;
     int other = -1;
-    for (int j = 0; j < ridge_count(b); j++) {
+    for (int n = 0; n < parting.near_b.many(hull_b.ridges); n++) {
         Crossing crossing;
-        if (!cross_edges(first, edge_in(problem, env, a, b, rotations, j), crossing)) continue;
+        int j = parting.near_b.edge(n);
+        if (!cross_edges(first, edge_in(parting, hull_b, j), crossing)) continue;
         if (!crossing.within || crossing.leaves != (slot % 2 == 1)) continue;
         if (crossing.lean > Number(OUT_OF_FACE) || !(plain(dot(crossing.normal, axis)) > Number(PARALLEL))) continue;
         if (!(plain(crossing.gap) < least)) continue;
@@ -297,7 +351,7 @@ __device__ bool face_edges(const Problem& problem, const Environment& env, int p
     }
     if (other < 0) return false;
     Crossing crossing;
-    cross_edges(first, edge_in(problem, env, a, b, rotations, other), crossing);
+    cross_edges(first, edge_in(parting, hull_b, other), crossing);
     Vec point = first.start + crossing.place * first.along +
                 (first.radius + crossing.place * first.widening + Number(0.5) * crossing.gap) * crossing.normal;
     facing.gap = crossing.gap;
@@ -426,7 +480,7 @@ __device__ int touch_pair(const Problem& problem, Environment& env, int p, const
         if (boxes_apart(cb, ca, frames[0], margin) || boxes_apart(ca, cb, frames[1], margin)) end = 0;
 #if HULLS
         // nothing of one hull is nearer to the other one than the gap along the normal that parts them best
-        if (end > 0 && part(problem, env, p, rotations, parting) && parting.gap > limit) end = 0;
+        if (end > 0 && part(problem, env, p, rotations, limit, parting) && parting.gap > limit) end = 0;
 #endif
 #if LINKS
         if (end > 0) {

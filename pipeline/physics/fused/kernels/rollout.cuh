@@ -114,7 +114,7 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
 #if PAIRED
         Parting parting;
 #if HULLS
-        if (pair_b(p) >= 0) part(problem, env, p, rotations, parting);
+        if (pair_b(p) >= 0) part(problem, env, p, rotations, Number(1e30), parting);
 #endif
 #endif
         EACH_SLOT
