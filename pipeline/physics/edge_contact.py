@@ -23,8 +23,9 @@ from .hull import PARALLEL, Hull
 
 LEAST_CROSSING = 1e-4
 """Least squared sine between two edges that touch in a point; the corners of parallel ones carry them."""
-OUT_OF_FACE = 0.01
-"""By how much the normal of a contact may lean towards one of the faces of an edge [1]: for faces on each other."""
+OUT_OF_FACE = 0.1
+"""By how much the normal of a contact may lean towards one of the faces of an edge [1]: for faces on each other, which
+inner spheres tilt by some hundredths."""
 
 FACE_SLACK_M = 2e-4
 """By how much worse than edges the faces may part two bodies that still lie flat on each other [m]: a tilt."""
