@@ -115,9 +115,9 @@ def select_next(
     names = {e.name: e for e in done}
     ranking = [*done, *(e for e in evidence if e.name not in names)]
     equals = _equals(done, linear, kept, variants, dispersion)
-    if flight.noise_model.slow:
+    if flight.noise_model != WHITE:
         equals = _with_unproven(equals, done, linear.episode)
-    named = not any(is_slight(e) for e in equals) and (flight.noise_model == WHITE or repeats(equals[0]))
+    named = not any(is_slight(e) for e in equals) and (flight.noise_model == WHITE or predicts_episodes(equals[0]))
     return SelectionStep(tuple(ranking), tuple(equals), named)
 
 
@@ -147,7 +147,7 @@ def _refitted_shortlist(
     return [e for e in best.values() if e.delta_bic is not None and e.delta_bic < 0]
 
 
-def repeats(evidence: Evidence) -> bool:
+def predicts_episodes(evidence: Evidence) -> bool:
     """Return whether an effect predicts held-out episodes without the one that gains most, too.
 
     No model of correlated errors is exact: a burst, the smeared edge of a contact or the rest of a hand looks like a
@@ -243,8 +243,8 @@ def _with_unproven(equals: Sequence[Evidence], done: Sequence[Evidence], episode
 
     Simplest is what acts alone, then what has the fewest parameters: a wind acts through a drag, a tilt does not.
 
-    Beside slow errors a difference counts where it is the same from episode to episode (a paired t-test): no model of
-    such errors is exact, and a misfit of one episode is one error, not one in each frame.
+    Beside correlated errors a difference counts where it is the same from episode to episode (a paired t-test): no
+    model of such errors is exact, and a misfit of one episode is one error, not one in each frame.
 
     Args:
         equals: The best refitted candidate and those that explain the data equally well.

@@ -1,8 +1,8 @@
 """What flights show: the effects that they lack, judged beside the errors that the tracks carry, and what is left.
 
 The search runs once under the noise of short windows. What neither its effects nor all candidates together follow is
-then split into slow errors (`segments/slow_errors`), unless the noise explains what is left; where there are any, the
-search runs again under them, on whole flights, so that an effect counts as far as it does the same in all episodes.
+then split into the errors of whole flights (`segments/slow_errors`), unless white noise explains what is left; where
+there are any, the search runs again under them, so that an effect counts as far as it does the same in all episodes.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from ..segments.prepare import Prepared
 from ..segments.repeated_forces import RepeatedForce, repeated_force
 from ..segments.residual_wrench import Omnibus, ResidualWrenches, dispersion, wrench_windows
 from ..segments.segments import Segments
-from ..segments.slow_errors import SlowErrors, slow_errors
+from ..segments.slow_errors import SlowErrors, flight_errors
 from .alternative_laws import OtherLaw
-from .effect_selection import SelectionStep
+from .effect_selection import SelectionStep, predicts_episodes
 from .falsification import Consistency
 from .flight_omnibus import flight_windows, is_significant, worst_omnibus
 from .flight_selection import judged, selected
@@ -92,6 +92,12 @@ class FlightFindings:
         return self.left is not None and self.left.p_value < LIMITS.repeated_p
 
     @property
+    def predicts(self) -> bool:
+        """Whether each selected effect predicts more than one held-out episode; False without any."""
+        chosen = [step.best for step in self.steps if step.flagged]
+        return bool(chosen) and all(predicts_episodes(one) for one in chosen)
+
+    @property
     def differs(self) -> bool:
         """Whether what is left differs from episode to episode and follows nothing, as slow errors of the tracking."""
         return self.slow is not None and not self.repeats and self.own_law is None
@@ -121,28 +127,30 @@ def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candi
         candidates: All candidates.
     """
     found = _searched(prepared, prepared, world, candidates, None)
-    if not (found.remains or found.doubtful):
+    if not (prepared.noise_model.correlated or found.remains or found.doubtful):
         return found
-    slow, law = _told_slow_errors(prepared, found.world, candidates)
-    if slow is None:
+    errors, law = _told_errors(prepared, found.world, candidates)
+    if errors is None:
         return replace(found, own_law=law)
-    found = _searched(prepared.with_slow_noise(world, slow.noise_model), prepared, world, candidates, slow, law)
+    beside = prepared.with_slow_noise(world, errors.noise_model, flights=errors.flights)
+    found = _searched(beside, prepared, world, candidates, errors, law)
     by_group = [p.name.partition(".")[0] for p in effect_parameters(found.world) if p.shared == "group"]
     if not by_group or not set(by_group) - {active.effect.name for active in world.effects}:
         return found
     # what groups have of their own counted as slow errors of the tracks, and hid which effect it is
-    beside, own_law = _told_slow_errors(
+    errors, own_law = _told_errors(
         prepared.with_own(found.world), found.world, candidates, not set(by_group) & set(TILTS)
     )
-    if beside is None:
+    if errors is None or not errors.noise_model.slow:
         return found
-    return _searched(prepared.with_slow_noise(world, beside.noise_model), prepared, world, candidates, beside, own_law)
+    beside = prepared.with_slow_noise(world, errors.noise_model, flights=errors.flights)
+    return _searched(beside, prepared, world, candidates, errors, own_law)
 
 
-def _told_slow_errors(
+def _told_errors(
     prepared: Prepared, world: World, candidates: Sequence[Candidate], tilted: bool = True
 ) -> tuple[SlowErrors | None, str | None]:
-    """Return the slow errors beside the effects of a world, and what accelerations follow that are no tilts.
+    """Return the errors of flights beside the effects of a world, and what accelerations follow that are no tilts.
 
     Args:
         prepared: The episodes.
@@ -150,21 +158,17 @@ def _told_slow_errors(
         candidates: All candidates.
         tilted: Whether episodes may have a tilt of their own; not where their groups have one.
     """
-    slow = _slow_errors(prepared, world, candidates)
+    kept, _ = admissible(world, candidates, prepared.has_orientation)
+    slow = flight_errors(prepared, world, variants_of(kept, world.gravity[0, :1]))
     if slow is None or not slow.sway_evidence:
         return slow, None
     if not tilted:
         return slow.tiltless(), None
     own = own_tilts(prepared, world, candidates, slow)
-    if own.kind == "levelling":
-        return replace(slow, sway_evidence=0.0), own.law
-    return (slow if own.kind == "tilts" else slow.tiltless()), own.law
-
-
-def _slow_errors(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> SlowErrors | None:
-    """Return the slow errors beside the selected effects and all candidates; None where there are none."""
-    kept, _ = admissible(world, candidates, prepared.has_orientation)
-    return slow_errors(prepared, world, variants_of(kept, world.gravity[0, :1]))
+    if own.kind == "tilts":
+        return slow, own.law
+    # what is not named as a tilt counts as an error all the same, unless it is a force, which nothing may hide
+    return (slow.tiltless() if own.kind == "force" else replace(slow, sway_evidence=0.0)), own.law
 
 
 def _searched(
@@ -172,7 +176,7 @@ def _searched(
     quick: Prepared,
     world: World,
     candidates: Sequence[Candidate],
-    slow: SlowErrors | None,
+    errors: SlowErrors | None,
     own_law: str | None = None,
 ) -> FlightFindings:
     """Return the findings under the noise of prepared episodes.
@@ -183,13 +187,14 @@ def _searched(
             episode whatever their law.
         world: The model's world.
         candidates: All candidates.
-        slow: The slow errors.
+        errors: The errors of whole flights; None for those of short windows.
         own_law: What accelerations that differ from episode to episode follow.
     """
+    slow = errors if errors is not None and errors.noise_model.slow else None
     windows = flight_windows(prepared, world)
     scatter = max(prepared.slow, dispersion(*windows[-1])) if windows else 1.0
     before = worst_omnibus(windows, scatter)
-    found = selected(prepared, world, candidates, scatter, slow)
+    found = selected(prepared, world, candidates, scatter, errors)
     prepared, quick = prepared.with_own(found.world), quick.with_own(found.world)
     tested = judged(prepared, found, scatter, slow, own_law is not None)
     found, changed = tested.selection, tested.selection.world is not world

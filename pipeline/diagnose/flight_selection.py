@@ -65,15 +65,16 @@ class JudgedSelection:
 
 
 def selected(
-    prepared: Prepared, world: World, candidates: Sequence[Candidate], scatter: float, slow: SlowErrors | None
+    prepared: Prepared, world: World, candidates: Sequence[Candidate], scatter: float, errors: SlowErrors | None
 ) -> FlightSelection:
     """Select effects with one value for all episodes; beside slow errors also with one for each episode or group."""
     found = FlightSelection(*flight_search(prepared, world, candidates, scatter))
-    if found.flight is None or slow is None:
+    if found.flight is None or errors is None:
         return found
-    found = _with_own_tilts(prepared, found, candidates, slow)
+    if errors.noise_model.slow:
+        found = _with_own_tilts(prepared, found, candidates, errors)
     found = _reselected(prepared, found, _with_the_needed(found), candidates, scatter)
-    if found.flight is None:
+    if found.flight is None or not errors.noise_model.slow:
         return found
     grouped = with_group_values(prepared, found.steps, found.world, found.flight, candidates, scatter)
     return FlightSelection(*grouped)
@@ -140,7 +141,7 @@ def _with_own_tilts(
 def _with_the_needed(found: FlightSelection) -> FlightSelection:
     """Leave out each of several effects without which the others predict held-out flights as well.
 
-    Beside slow errors, whose model is not exact, the fall of BIC alone also takes an effect that adds nothing.
+    Beside correlated errors, whose model is not exact, the fall of BIC alone also takes an effect that adds nothing.
     """
     for step in reversed(found.steps):
         name = step.best.name

@@ -73,15 +73,17 @@ class FlightThresholds:
     paired_t: float = threshold(
         3.0,
         "standard errors",
-        "beside slow errors a rival is ruled out where it is worse by this much in the mean over episodes",
+        "beside correlated errors a rival is ruled out where it is worse by this much in the mean over episodes",
         "by argument: with 12 episodes 0.6 % of rivals that are as good lie farther off",
     )
     repeated_gain: float = threshold(
-        12.0,
+        6.0,
         "chi2",
-        "beside correlated errors, held-out episodes have to gain this without the one that gains most: odds of 400",
+        "beside correlated errors, held-out episodes have to gain this without the one that gains most: odds of 20; "
+        "where more than the noise is left, effects that do are named all the same",
         BY_ARGUMENT,
-        "real-like development, even seeds: a magnet from smeared edges of contacts gained 4, true effects 35 or more",
+        "real-like development, even seeds: a magnet from smeared edges of contacts gained 4; true small ones, at the "
+        "noise of whole flights, 6 or more",
     )
     measured: float = threshold(
         0.04,
@@ -122,7 +124,7 @@ class VerdictThresholds:
     needed_share: float = threshold(
         0.02,
         "1",
-        "beside slow errors, of several effects one is left out if the loss of held-out flights then rises by less",
+        "beside correlated errors, one of several effects is left out if the loss of held-out flights rises by less",
         "by argument, as in `improve`; looked at on one recording of throws, it takes away the second of two drags",
     )
     common_share: float = threshold(
@@ -144,10 +146,11 @@ class VerdictThresholds:
         BY_ARGUMENT,
     )
     lasting_p: float = threshold(
-        0.005,
+        0.02,
         "probability",
         "see `lasting_ratio`",
-        "real-like development, even seeds: a gust named a tilt (0.001); forces that last had 0.03 or more",
+        "real-like development, even seeds: a gust named a tilt (0.016), gravity that sets in named buoyancy (0.011); "
+        "forces that last had 0.03 or more",
         "a gust that fills the flights (0.15 of 0.37 s) passes: early and late differ by less than their errors",
     )
     own_episodes: int = threshold(

@@ -106,12 +106,12 @@ def find(
 def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
     """Return the verdict from the selected effects and the findings in flight.
 
-    Without slow errors all that is left in flight is physics, and the effects have to explain nearly all of it. Beside
-    slow errors they have to explain what repeats from episode to episode: what does not is an error of the tracking,
-    of which no model is exact, or cannot be told from one.
+    What is left in flight is physics or an error of the tracking, of which no model is exact. Effects that predict
+    episodes that they were not fitted to have to explain what repeats from episode to episode; all others nearly all.
     """
     too_little = is_significant(flown.after) and flown.explained_share < LIMITS.enough_share
-    if flown.doubtful or (flown.slow is None and too_little):
+    errors = flown.slow is not None or (flown.predicts and not flown.repeats)
+    if flown.doubtful or (too_little and not errors):
         return "unexplained"
     if not chosen and flown.remains and not flown.differs:
         return "unexplained"

@@ -88,7 +88,13 @@ class Prepared:
             return None
         return fit_states(self.segments("contact", world, self.contact_items))
 
-    def with_slow_noise(self, world: World, noise_model: NoiseModel, noise: Noise | None = None) -> Prepared:
+    def with_slow_noise(
+        self,
+        world: World,
+        noise_model: NoiseModel,
+        noise: Noise | None = None,
+        flights: Sequence[Segment] = (),
+    ) -> Prepared:
         """Return the episodes with a noise model that has a slow part, and their flights whole.
 
         The slow errors of neighbouring pieces of a flight are not independent, so the flights are cut nowhere; the
@@ -98,11 +104,12 @@ class Prepared:
             world: The world to fit the states with.
             noise_model: The noise model.
             noise: Standard deviations of the tracks; those of the episodes by default.
+            flights: Whole flights that count; all by default.
         """
         found = replace(self, noise_model=noise_model, noise=noise or self.noise, slow=1.0)
         if self.flight is None:
             return found
-        items = whole_flights(self.flight.items)
+        items = flights or whole_flights(self.flight.items)
         return replace(found, flight=fit_states(found.segments("flight", world, items)))
 
     def with_own(self, world: World) -> Prepared:

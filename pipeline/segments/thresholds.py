@@ -296,6 +296,13 @@ class SlowErrorThresholds:
         3, "episodes", "fewest that tell what differs between them from what is common", BY_ARGUMENT
     )
     least_frames: int = threshold(60, "frames", "fewest of all flights, as for the size of the noise", BY_ARGUMENT)
+    unsound: float = threshold(
+        6.0,
+        "1",
+        "flights whose variance, beside all that effects could do in them, is this many times that of the quietest "
+        "quarter are left out: they hold a contact, a hand or smoothed bursts",
+        "by argument: they would count for a sixth of the others",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

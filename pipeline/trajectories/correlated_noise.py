@@ -2,9 +2,10 @@
 
 A tracker that filters, a marker that moves over a ball or a calibration with local errors makes errors that
 neighbouring frames share. Forces are identified by slow changes, and correlated errors are slow. The noise is an
-Ornstein-Uhlenbeck process plus white noise: with a share s of the variance that decays with time constant tau, the
-covariance of two frames is s exp(-|dt| / tau), plus 1 - s on the diagonal (see `innovations`). Errors slower than a
-window do not show here; they are looked for in whole flights (`segments/slow_errors`).
+process of Matern's class plus white noise: with a share s of the variance whose correlation is k(dt), the covariance of
+two frames is s k(dt), plus 1 - s on the diagonal (see `innovations`). The order of the process matters: of errors that
+a filter has smoothed, one that is not differentiable makes the slow part a hundred times too large. Errors slower than
+a window do not show here; they are looked for in whole flights (`segments/slow_errors`).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ..optimization.levenberg_marquardt import Solution
-from .innovations import WHITE, CorrelatedNoise, NoiseModel
+from .innovations import WHITE, CorrelatedNoise, NoiseModel, matern
 from .observations import Observations
 from .segmentation import Segment
 from .thresholds import TRACK_THRESHOLDS
@@ -44,9 +45,11 @@ zero."""
 LEAST = 4
 """Minimum number of frames of a window in excess of the coefficients of its polynomial."""
 REMEMBERED = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-"""Correlations from one frame to the next that are tried."""
-SHARES = (1.0, 0.75, 0.5, 0.25)
-"""Shares of the variance that is correlated, that are tried."""
+"""Correlations from one frame to the next of a process of order 1/2, whose times are tried for all orders."""
+SHARES = {0.5: (1.0, 0.75, 0.5, 0.25), 1.5: (0.99, 0.9, 0.75, 0.5, 0.25), 2.5: (0.999, 0.99, 0.9, 0.75, 0.5)}
+"""Shares of the variance that is correlated, that are tried, by order: what is smooth alone could not be inverted."""
+FAR = 200
+"""Number of frames over which correlations are summed for the size of the slow part."""
 FLOORS = (FLOOR_M, FLOOR_RAD)
 """Smallest standard deviations of position [m] and rotation [rad] at which correlation is looked for."""
 ROBUST_SCALE = 3.0
@@ -96,9 +99,9 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
     Restricted maximum likelihood (Patterson & Thompson 1971): of the residuals of a polynomial in every window.
     """
     windows = _windows(whole, flight, kind)
-    if sum(w.left.size for w in windows) < LIMITS.enough:
+    if sum(w.count for w in windows) < LIMITS.enough:
         return _Found(CorrelatedNoise(), 0.0, 0.0)
-    sizes = np.concatenate([(w.left**2).mean((1, 2)) for w in windows])
+    sizes = np.concatenate([w.variances for w in windows])
     kept = [w.without(LIMITS.wrong * float(np.median(sizes))) for w in windows]
     windows = [w for w in kept if len(w.left)]
     step = float(np.median([np.median(np.diff(w.times_s, axis=1)) for w in windows]))
@@ -106,11 +109,15 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
     if white_std == 0:  # values that never change, or repeat a polynomial to the last bit: there are no errors to see
         return _Found(CorrelatedNoise(), 0.0, 0.0)
     tried = []
-    for remembered, share in itertools.product(REMEMBERED, SHARES):
-        noise = CorrelatedNoise(share, -step / math.log(remembered))
-        likelihood, std = _likelihood(windows, noise)
-        slow = std**2 * (1 - share + share * (1 + remembered) / (1 - remembered))
-        tried.append((2 * (likelihood - alone), slow, noise, std))
+    gaps = step * torch.arange(1, FAR, dtype=torch.float64)
+    for order, remembered in itertools.product(SHARES, REMEMBERED):
+        time_s = -step / math.log(remembered)
+        alike = 1 + 2 * float(matern(gaps, time_s, order).sum())
+        for share in SHARES[order]:
+            noise = CorrelatedNoise(share, time_s, order=order)
+            likelihood, std = _likelihood(windows, noise)
+            slow = std**2 * (1 - share + share * alike)
+            tried.append((2 * (likelihood - alone), slow, noise, std))
     most, _, _, likeliest = max(tried)
     # forces are found from slow changes, where windows show the errors least: the larger slow part is the safe choice
     likely = [(slow, noise, std) for evidence, slow, noise, std in tried if evidence > most - LIMITS.likely]
@@ -132,33 +139,57 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Windows (W) of n frames each, projected on what no polynomial of the degree contains (m dimensions)."""
+    """Windows (W) of n frames each, less the polynomials of d coefficients that fit them best."""
 
     times_s: Array
     """Frame times, shape (W, n) [s]."""
     basis: Array
-    """Orthonormal complement of the polynomials, shape (W, n, m)."""
+    """Orthonormal basis of the polynomials, shape (W, n, d)."""
     left: Array
-    """Projected measurements, shape (W, m, c) [m or rad]."""
+    """What the polynomials leave of the measurements, shape (W, n, c) [m or rad]."""
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom of each window."""
+        return (self.left.shape[1] - self.basis.shape[2]) * self.left.shape[2]
+
+    @property
+    def count(self) -> int:
+        """Degrees of freedom of all windows."""
+        return len(self.left) * self.dof
+
+    @property
+    def variances(self) -> Array:
+        """Variance of each window (W,)."""
+        return np.asarray((self.left**2).sum((1, 2)) / self.dof)
 
     def without(self, above: float) -> _Windows:
-        """Return the windows whose mean square is at most a limit."""
-        kept = (self.left**2).mean((1, 2)) <= above
+        """Return the windows whose variance is at most a limit."""
+        kept = self.variances <= above
         return _Windows(self.times_s[kept], self.basis[kept], self.left[kept])
 
 
 def _likelihood(windows: Sequence[_Windows], noise: CorrelatedNoise) -> tuple[float, float]:
-    """Return the largest restricted log-likelihood of a noise model, and its standard deviation."""
+    """Return the largest restricted log-likelihood of a noise model, and its standard deviation.
+
+    Of the residuals of polynomials B of a covariance C: of the dof of all their contrasts, whose covariance has the
+    determinant |C| |B' C^-1 B| (Harville 1974).
+    """
     square, logs, count = 0.0, 0.0, 0
     for w in windows:
         gap = np.abs(w.times_s[:, :, None] - w.times_s[:, None])
-        together = noise.share * np.exp(-gap / noise.time_s) + (1 - noise.share) * np.eye(gap.shape[1])
-        factor = np.linalg.cholesky(np.swapaxes(w.basis, 1, 2) @ together @ w.basis)
-        white = np.linalg.solve(factor, w.left)
-        square += float((white**2).sum())
-        logs += 2 * w.left.shape[2] * float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
-        count += w.left.size
-    variance = square / max(count, 1)
+        alike = matern(torch.from_numpy(gap), noise.time_s, noise.order)
+        together = noise.share * alike + (1 - noise.share) * torch.eye(gap.shape[1], dtype=torch.float64)
+        factor = torch.linalg.cholesky(together)
+        both = torch.from_numpy(np.concatenate((w.basis, w.left), 2))
+        basis, left = torch.linalg.solve_triangular(factor, both, upper=False).tensor_split([w.basis.shape[2]], 2)
+        inner = torch.linalg.cholesky(basis.mT @ basis)
+        along = torch.linalg.solve_triangular(inner, basis.mT @ left, upper=False)
+        square += float(left.square().sum() - along.square().sum())
+        roots = (one.diagonal(dim1=1, dim2=2).log().sum() for one in (factor, inner))
+        logs += 2 * w.left.shape[2] * float(sum(roots))
+        count += w.count
+    variance = max(square / max(count, 1), 0.0)
     return -0.5 * (logs + count * np.log(max(variance, 1e-300))), float(np.sqrt(variance))
 
 
@@ -183,8 +214,9 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int) -> list[
                     quat = whole.quat_wxyz[segment.episode, chosen, column]
                     values = quat_log(quat_multiply(quat_conjugate(quat[length // 2]), quat)).numpy()
                 scaled = 2 * (t - t[0]) / (t[-1] - t[0]) - 1
-                basis = np.linalg.qr(np.vander(scaled, degree + 1), mode="complete")[0][:, degree + 1 :]
-                found.setdefault((length, degree, values.shape[1]), []).append((t, basis, basis.T @ values))
+                basis = np.linalg.qr(np.vander(scaled, degree + 1))[0]
+                left = values - basis @ (basis.T @ values)
+                found.setdefault((length, degree, values.shape[1]), []).append((t, basis, left))
     return [_Windows(*(np.stack(parts) for parts in zip(*some, strict=True))) for some in found.values()]
 
 

@@ -1,10 +1,11 @@
 """Models of correlated measurement errors, and the whitening of residuals by them.
 
-The errors of one coordinate are the sum of white noise, an Ornstein-Uhlenbeck process (a filter, a marker that comes
-into view), a second, slower one (a calibration with local errors, a marker that moves over the body), and, across
-gravity, the path of an acceleration that is constant in a flight and differs from flight to flight (a frame that is
-levelled anew for each episode). Residuals are replaced by their innovations, so that later steps may assume
-independence: this is generalised least squares with these errors as random effects.
+The errors of one coordinate are the sum of white noise, a process of Matern's class (a filter, a marker that comes into
+view; of order 1/2, Ornstein and Uhlenbeck's, it is not differentiable, of order 3/2 once, of order 5/2 twice, as what a
+low pass leaves), a second, slower one of order 1/2 (a calibration with local errors, a marker that moves over the
+body), and, across gravity, the path of an acceleration that is constant in a flight and differs from flight to flight
+(a frame that is levelled anew for each episode). Residuals are replaced by their innovations, so that later steps may
+assume independence: this is generalised least squares with these errors as random effects.
 """
 
 from __future__ import annotations
@@ -19,12 +20,14 @@ from torch import Tensor
 
 RESOLUTION_S = 1e-12
 """Frame times [s] closer than this are the same: the times of recorded episodes share a grid up to rounding."""
+FALLS = {0.5: 1.0, 1.5: 2.1461932, 2.5: 2.90463}
+"""Rates of processes of each order, in which the correlation falls to 1/e in one unit of time."""
 MOST_NUMBERS = 2_000_000
 """Maximum size of the whitening matrices of a batch; above it the filter runs over its frames."""
 
 
 class CorrelatedNoise(NamedTuple):
-    """Noise of one kind: white noise, an Ornstein-Uhlenbeck process, and slow errors."""
+    """Noise of one kind: white noise, a process of Matern's class, and slow errors."""
 
     share: float = 0.0
     """Share of the variance, without that of slow errors, that is correlated."""
@@ -41,6 +44,8 @@ class CorrelatedNoise(NamedTuple):
     """Standard deviation of each flight's own acceleration across gravity, in units of the tracks' per s2."""
     level: tuple[int, ...] = (0, 1)
     """Axes across gravity."""
+    order: float = 0.5
+    """Order of the process: 1/2, 3/2 or 5/2."""
 
     @property
     def white(self) -> bool:
@@ -61,9 +66,29 @@ class NoiseModel(NamedTuple):
         """Whether slow errors are part of it."""
         return any(one.slow or one.sway for one in self)
 
+    @property
+    def correlated(self) -> bool:
+        """Whether errors of neighbouring frames are correlated."""
+        return any(one.share for one in self)
+
 
 WHITE = NoiseModel()
 """Uncorrelated noise."""
+
+
+def matern(gaps_s: Tensor, time_s: float | Tensor, order: float) -> Tensor:
+    """Return the correlation over gaps [s] of a process of an order, by Rasmussen & Williams (2006), eq. 4.16 f.
+
+    Args:
+        gaps_s: Times between two frames, not negative.
+        time_s: In which the correlation falls to 1/e.
+        order: 1/2, 3/2 or 5/2.
+    """
+    x = gaps_s * (FALLS[order] / time_s)
+    if order == 0.5:
+        return torch.exp(-x)
+    x = x.clamp_max(700.0)  # where the exponential is not yet 0
+    return (1 + x + (x.square() / 3 if order > 2 else 0.0)) * torch.exp(-x)
 
 
 def innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNoise) -> Tensor:
@@ -123,8 +148,8 @@ def _whitening(grids: tuple[bytes, ...], noise: CorrelatedNoise) -> Tensor:
 
 def _filtered(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNoise) -> Tensor:
     """Return the innovations by a filter that runs over the frames; arguments as of `innovations`."""
-    if noise.slow or noise.sway:
-        return _slow_innovations(rows, times_s, mask, noise)
+    if noise.slow or noise.sway or noise.order != 0.5:
+        return _state_innovations(rows, times_s, mask, noise)
     share = noise.share
     kept = torch.exp(-times_s.diff(dim=1) / noise.time_s)
     rows = rows / noise.size
@@ -155,21 +180,26 @@ def axis_innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: Correla
     return found
 
 
-def _slow_innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNoise) -> Tensor:
-    """Return the innovations by a filter with three states: both processes, and the acceleration of the flight."""
+def _state_innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNoise) -> Tensor:
+    """Return the innovations by a filter whose states are both processes and the acceleration of the flight."""
     square = noise.size**2
-    fast, white = square * noise.share, square * (1 - noise.share)
-    still = times_s.new_tensor([fast, noise.slow**2, noise.sway**2])
+    white, size = square * (1 - noise.share), round(noise.order + 0.5)
+    still = torch.zeros(size + 2, size + 2).to(times_s)
+    still[:size, :size] = square * noise.share * _stationary(size).to(times_s)
+    still[size, size], still[-1, -1] = noise.slow**2, noise.sway**2
     since, steps = times_s - times_s[:, :1], times_s.diff(dim=1)
-    kept = torch.stack(
-        [torch.exp(-steps / noise.time_s), torch.exp(-steps / noise.slow_time_s), torch.ones_like(steps)], -1
-    )
-    covariance = torch.diag(still).expand(len(rows), 3, 3)
-    expected = rows.new_zeros(len(rows), 3, *rows.shape[2:])
+    kept = torch.zeros(*steps.shape, size + 2, size + 2).to(times_s)
+    kept[..., :size, :size] = _transition(steps * (FALLS[noise.order] / noise.time_s), size)
+    kept[..., size, size], kept[..., -1, -1] = torch.exp(-steps / noise.slow_time_s), 1.0
+    fresh = still - kept @ still @ kept.mT
+    covariance = still.expand(len(rows), -1, -1)
+    expected = rows.new_zeros(len(rows), size + 2, *rows.shape[2:])
+    seen = torch.zeros(len(rows), size + 2).to(times_s)
+    seen[:, 0] = seen[:, size] = 1.0
     found = []
     for frame in range(rows.shape[1]):
         counted = (mask[:, frame] > 0).to(rows)
-        seen = torch.stack([torch.ones_like(counted), torch.ones_like(counted), 0.5 * since[:, frame].square()], -1)
+        seen[:, -1] = 0.5 * since[:, frame].square()
         along = (covariance @ seen[..., None])[..., 0]
         spread = (seen * along).sum(-1) + white
         gain = along / spread[:, None] * counted[:, None]
@@ -177,14 +207,40 @@ def _slow_innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: Correl
         away = rows[:, frame] - ahead * _expanded(counted, rows)
         found.append(away * _expanded(torch.where(counted > 0, spread.rsqrt(), torch.ones_like(spread)), rows))
         if frame < rows.shape[1] - 1:
-            factor = kept[:, frame]
             expected = expected + gain.view(*gain.shape, *[1] * (rows.ndim - 2)) * away[:, None]
-            expected = expected * factor.view(*factor.shape, *[1] * (rows.ndim - 2))
+            expected = torch.einsum("bjk,bk...->bj...", kept[:, frame], expected)
             covariance = covariance - gain[:, :, None] * along[:, None]
-            covariance = factor[:, :, None] * factor[:, None] * covariance + torch.diag_embed(
-                still * (1 - factor.square())
-            )
+            covariance = kept[:, frame] @ covariance @ kept[:, frame].mT + fresh[:, frame]
     return torch.stack(found, 1)
+
+
+def _stationary(size: int) -> Tensor:
+    """Return the covariance of a process of variance 1 and of its derivatives, each over the rate."""
+    if size < 3:
+        return torch.eye(size)
+    third = 1 / 3
+    return torch.tensor([[1.0, 0.0, -third], [0.0, third, 0.0], [-third, 0.0, 1.0]], dtype=torch.float64)
+
+
+def _transition(u: Tensor, size: int) -> Tensor:
+    """Return how a process and its derivatives, each over the rate, go on: the exponential of its companion matrix.
+
+    Args:
+        u: Rate times time.
+        size: Number of states, the order plus 1/2.
+    """
+    if size == 1:
+        entries = [[torch.ones_like(u)]]
+    elif size == 2:
+        entries = [[1 + u, u], [-u, 1 - u]]
+    else:
+        half = 0.5 * u.square()
+        entries = [
+            [1 + u + half, u + 2 * half, half],
+            [-half, 1 + u - 2 * half, u - half],
+            [half - u, 2 * half - 3 * u, 1 - 2 * u + half],
+        ]
+    return torch.stack([torch.stack(row, -1) for row in entries], -2) * torch.exp(-u)[..., None, None]
 
 
 def _expanded(values: Tensor, rows: Tensor) -> Tensor:

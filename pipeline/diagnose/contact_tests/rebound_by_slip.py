@@ -56,6 +56,8 @@ def gains_beside_slip(base: ImpactBase, problem: ImpactProblem, fit: ImpactFit) 
 def held_out_gains(rows: Array, value: Array, sigma: Array, episode: NDArray[np.int64]) -> Array:
     """Return the fall of chi2 of each episode by the last column, with coefficients from the other episodes.
 
+    The only episode is predicted by none: its fall is 0.
+
     Args:
         rows: Columns, the constant first, shape (n, P).
         value: What is predicted, shape (n,).
@@ -65,6 +67,8 @@ def held_out_gains(rows: Array, value: Array, sigma: Array, episode: NDArray[np.
     gains = []
     for own in np.unique(episode):
         held = episode == own
+        if held.all():
+            return np.zeros(1)
         chi2 = []
         for count in (rows.shape[1] - 1, rows.shape[1]):
             weighted = rows[~held, :count] / sigma[~held, None]

@@ -11,7 +11,7 @@ import pytest
 import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.diagnose import diagnose, flight_search, stage
-from cgwm.pipeline.diagnose.effect_selection import SelectionStep, is_slight, repeats, select_next
+from cgwm.pipeline.diagnose.effect_selection import SelectionStep, is_slight, predicts_episodes, select_next
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.falsification import consistency
 from cgwm.pipeline.diagnose.flight_equals import fitted_contact, resolved_flight, separated
@@ -403,9 +403,9 @@ def test_what_is_small_needs_more_evidence(size: float, delta_bic: float | None,
 def test_beside_correlated_errors_what_is_named_shows_in_more_than_one_episode() -> None:
     test = ScoreTest(statistic=30.0, dof=1, p_value=1e-5, estimate=np.zeros(1), covariance=np.eye(1), admissible=True)
     found = Evidence(candidate=Candidate("buoyancy", load_effect("buoyancy")), constants={}, test=test, p_value=1e-5)
-    assert repeats(replace(found, gains=(18.0, 10.0, -3.0, 6.0)))
-    assert not repeats(replace(found, gains=(18.0, 3.0, 1.0, 0.0)))
-    assert not repeats(replace(found, gains=(80.0, 20.0, -10.0, 0.0)))
+    assert predicts_episodes(replace(found, gains=(18.0, 10.0, -3.0, 6.0)))
+    assert not predicts_episodes(replace(found, gains=(18.0, 3.0, 1.0, 0.0)))
+    assert not predicts_episodes(replace(found, gains=(80.0, 20.0, -16.0, 0.0)))
 
 
 def test_steps_in_flight_are_short_enough_for_fine_measurements() -> None:

@@ -11,6 +11,7 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData, selected, with_effect
 from cgwm.pipeline.diagnose.contact_tests.impact import ImpactTest, gains_beside_slip
+from cgwm.pipeline.diagnose.contact_tests.rebound_by_slip import held_out_gains
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.verdict import find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
@@ -282,3 +283,8 @@ def test_a_rebound_that_falls_with_the_slip_is_no_rebound_that_falls_with_the_sp
         alone = base.gains(problem, fit.values)
         assert alone.sum() > 5
         assert gains.sum() < 1
+
+
+def test_bounces_of_one_episode_are_predicted_by_none() -> None:
+    rows = np.array([[1.0, 0.2, 0.1], [1.0, 0.4, 0.3]])
+    assert held_out_gains(rows, np.array([0.5, 0.6]), np.ones(2), np.zeros(2, np.int64)).tolist() == [0.0]

@@ -23,11 +23,12 @@ from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.flight_contrasts import moving  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.segments.prepare import Prepared, prepare, whole_flights
 from cgwm.pipeline.segments.repeated_forces import RepeatedForce, repeated_force  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.segments.residual_wrench import Omnibus, ResidualWrenches
-from cgwm.pipeline.segments.slow_errors import SlowErrors, moving  # pyright: ignore[reportMissingImports]
-from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, NoiseModel, axis_innovations  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.segments.slow_errors import SlowErrors  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.trajectories.innovations import FALLS, CorrelatedNoise, NoiseModel, axis_innovations, matern  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.trajectories.segmentation import Segment
 from helpers.diagnosis_data import tosses, world_with
 
@@ -58,19 +59,20 @@ def found(effects: dict, tilt_m_s2: float = 0.0, seed: int = 1) -> Findings:
     return find(prepare(world, episodes), world, LIBRARY)
 
 
-def test_innovations_of_slow_errors_are_what_the_inverse_of_the_covariance_says() -> None:
+@pytest.mark.parametrize("order", FALLS)
+def test_innovations_of_slow_errors_are_what_the_inverse_of_the_covariance_says(order: float) -> None:
     rng = np.random.default_rng(0)
     times = torch.as_tensor(np.sort(rng.uniform(0, 0.8, (2, 10)), axis=1))
     mask = torch.ones(2, 10, dtype=torch.float64)
     mask[0, [3, 4, 8]] = 0
     rows = torch.as_tensor(rng.standard_normal((2, 10, 3, 4))) * mask[..., None, None]
-    noise = CorrelatedNoise(share=0.6, time_s=0.02, size=1.5, slow=4.0, slow_time_s=0.3, sway=30.0)
+    noise = CorrelatedNoise(share=0.6, time_s=0.02, size=1.5, slow=4.0, slow_time_s=0.3, sway=30.0, order=order)
     whitened = axis_innovations(rows, times, mask, noise)
     for k in range(2):
         kept = mask[k] > 0
         t = times[k, kept]
         gap, path = (t[:, None] - t).abs(), 0.5 * (t - times[k, 0]).square()
-        common = 2.25 * (0.6 * torch.exp(-gap / 0.02) + 0.4 * torch.eye(len(t))) + 16 * torch.exp(-gap / 0.3)
+        common = 2.25 * (0.6 * matern(gap, 0.02, order) + 0.4 * torch.eye(len(t))) + 16 * torch.exp(-gap / 0.3)
         for axis in range(3):
             covariance = common + (900 * path[:, None] * path if axis < 2 else 0)
             known = torch.linalg.solve_triangular(
@@ -117,7 +119,7 @@ def test_what_differs_from_episode_to_episode_beside_slow_errors_is_no_missing_p
     """No model of slow errors is exact: those of smoothed tracks exceed it in every episode, each in its own way."""
     silent = found({}).flight
     law = RepeatedForce(coordinate="x", frame="world", gains=(9.0, 10.0, 11.0) if repeats else (-9.0, 10.0, -11.0))
-    errors = SlowErrors(NoiseModel(), NoiseModel(), evidence=100.0, sway_evidence=0.0)
+    errors = SlowErrors(NoiseModel(), NoiseModel(), evidence=100.0, sway_evidence=0.0, flights=())
     left = replace(silent, slow=errors, left=law, after=Omnibus(3.0, 100.0, 1e-9), common_share=float(not repeats))
     assert left.remains and _verdict((), left) == ("unexplained" if repeats else "none_missing")
     assert _verdict((), replace(left, slow=None, left=None)) == "unexplained"
@@ -148,7 +150,7 @@ def test_rivals_in_the_presence_of_an_effect_that_has_gone_are_none(monkeypatch:
     world = world_with("ball", ground=False)
     errors = NoiseModel(position=CorrelatedNoise(share=0.5, time_s=0.02, slow=1.0, slow_time_s=0.2))
     prepared = prepare(world, flying).with_slow_noise(world, errors)
-    slow = SlowErrors(errors, errors, evidence=100.0, sway_evidence=0.0)
+    slow = SlowErrors(errors, errors, evidence=100.0, sway_evidence=0.0, flights=())
     left = _searched(prepared, prepared, world, LIBRARY, slow)
     assert [[one.name for one in step.equals] for step in left.steps] == [["linear_drag"]]
     remaining = remaining_of(left)
