@@ -28,6 +28,12 @@ Place = tuple[Coordinate, Coordinate]
 Factor = Annotated[float, Field(ge=0.1, le=10)]
 Positive = Annotated[float, Field(gt=0, le=1e9)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Rate = Annotated[float, Field(ge=0.1, le=10_000)]
+"""[Hz]."""
+HorizonLength = Annotated[float, Field(ge=1e-3, le=60)]
+"""[s]."""
+Knots = Annotated[int, Field(ge=1, le=1000)]
+Samples = Annotated[int, Field(ge=4, le=1_000_000)]
 
 
 class TaskSection(FileModel):
@@ -124,13 +130,13 @@ class CostsSection(TaskSection):
 class PlannerSection(TaskSection):
     """How plans are made."""
 
-    control_hz: Annotated[float, Field(ge=0.1, le=10_000)] = 30.0
+    control_hz: Rate = 30.0
     """Commands per second [Hz]."""
-    horizon_s: Annotated[float, Field(ge=1e-3, le=60)] = 1.5
+    horizon_s: HorizonLength = 1.5
     """Length of a plan [s]."""
-    knots: Annotated[int, Field(ge=1, le=1000)] = 15
+    knots: Knots = 15
     """Pieces of constant speed in a plan."""
-    samples: Annotated[int, Field(ge=4, le=1_000_000)] = 32
+    samples: Samples = 32
     """Sequences of commands that are compared for a plan."""
     step_s: Step = 0.01
     """Largest time step of a prediction [s]."""

@@ -9,7 +9,21 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from .base import read_toml
 from .capture import Name
-from .control import Angle, ControlTask, Factor, Positive, Range, Share, TaskSection, read_task
+from .control import (
+    Angle,
+    ControlTask,
+    Factor,
+    HorizonLength,
+    Knots,
+    PlannerSection,
+    Positive,
+    Range,
+    Rate,
+    Samples,
+    Share,
+    TaskSection,
+    read_task,
+)
 from .documents import parse_toml
 from .errors import did_you_mean
 from .quantities import Duration, Friction, Length, Position3, Step
@@ -95,36 +109,19 @@ class HandCostsSection(TaskSection):
     """A speed of the joints that costs 1 [rad/s], as a mean over horizon and joints."""
 
 
-class HandPlannerSection(TaskSection):
+class HandPlannerSection(PlannerSection):
     """How plans are made."""
 
-    control_hz: Annotated[float, Field(ge=0.1, le=10_000)] = 10.0
+    control_hz: Rate = 10.0
     """Commands per second [Hz]."""
-    horizon_s: Annotated[float, Field(ge=1e-3, le=60)] = 1.0
+    horizon_s: HorizonLength = 1.0
     """Length of a plan [s]."""
-    knots: Annotated[int, Field(ge=1, le=1000)] = 4
+    knots: Knots = 4
     """Pieces of a plan, in which the targets change at constant speed."""
-    samples: Annotated[int, Field(ge=4, le=1_000_000)] = 64
+    samples: Samples = 64
     """Sequences of commands that are compared for a plan."""
     step_s: Step = 0.02
     """Largest time step of a prediction [s]."""
-    risk: Literal["mean", "worst_quarter"] = "mean"
-    """What counts of the costs under several draws of the model (--draws)."""
-    bad_states: Annotated[int, Field(ge=1, le=1_000_000)] = 30
-    """States in a row that are missing, stale or no numbers, after which a run stops."""
-
-    @model_validator(mode="after")
-    def _holds_a_command(self) -> HandPlannerSection:
-        if self.horizon_s < 1 / self.control_hz:
-            raise ValueError(
-                f"horizon_s = {self.horizon_s:g} s is shorter than one command, which lasts 1/control_hz = "
-                f"{1 / self.control_hz:g} s"
-            )
-        if self.knots * self.step_s > self.horizon_s * (1 + 1e-9):
-            raise ValueError(
-                f"{self.knots} knots in {self.horizon_s:g} s are closer together than step_s = {self.step_s:g} s"
-            )
-        return self
 
 
 class HandSuccessSection(TaskSection):

@@ -67,22 +67,12 @@ class Controller(PlanningController):
             return found.planning(None if drawn is None else World.from_model(drawn, geometry=found.world))
 
         worlds = drawn_worlds(found.model, draws, seed, where, planned)
-        super().__init__(worlds, solver_of(solver, Mppi(task.planner.samples)), where, seed)
+        super().__init__(task.planner, worlds, solver_of(solver, Mppi(task.planner.samples)), where, seed)
 
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the joints, in the order of targets."""
         return JOINTS
-
-    @property
-    def interval_s(self) -> float:
-        """Length of a command [s]."""
-        return 1 / self.task.planner.control_hz
-
-    @property
-    def bad_states(self) -> int:
-        """Bad states in a row after which a run stops."""
-        return self.task.planner.bad_states
 
     def limits(self, joint: str) -> tuple[float, float, float]:
         """Return the smallest and the largest target of a joint [m], and its largest speed [m/s]."""

@@ -67,22 +67,12 @@ class HandController(PlanningController):
 
         worlds = drawn_worlds(model, draws, seed, where, planned)
         sampling = Mppi(task.planner.samples, noise=NOISE, alike=1)
-        super().__init__(worlds, solver_of(solver, sampling), where, seed)
+        super().__init__(task.planner, worlds, solver_of(solver, sampling), where, seed)
 
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the joints, in the order of targets."""
         return self.hand.joints
-
-    @property
-    def interval_s(self) -> float:
-        """Length of a command [s]."""
-        return 1 / self.task.planner.control_hz
-
-    @property
-    def bad_states(self) -> int:
-        """Bad states in a row after which a run stops."""
-        return self.task.planner.bad_states
 
     def limits(self, joint: str) -> tuple[float, float, float]:
         """Return the smallest and the largest target of a joint [rad], and its largest speed [rad/s]."""

@@ -14,7 +14,7 @@ from .hand_controller import HandController
 from .hand_objective import turn_to
 from .hand_plant import HandPlant, HandTruth
 from .horizon import Array
-from .loop import Recording, Sensor, Waiting, note_plan
+from .loop import Commander, Recording, Sensor
 
 
 def hand_start(task: HandTask, seed: int) -> tuple[Array, Array]:
@@ -58,22 +58,13 @@ def run_hand(controller: HandController, plant: HandPlant, seed: int, clock: Clo
     goal = next(goals)
     controller.aim(goal)
     sensor, recording = Sensor(task.plant, interval, seed), Recording(seed)
-    command = dict(zip(controller.joints, controller.hand.home.tolist(), strict=True))
-    waiting, acting, within, since = Waiting(interval, clock), None, 0.0, 0.0
+    commander = Commander(controller, clock, recording, task.planner.knots, controller.hand.home)
+    within, since = 0.0, 0.0
     for number in range(math.ceil(task.success.timeout_s / interval - 1e-9)):
         now = number * interval
-        state = sensor.seen(now, truth)
-        acting = waiting.arrived(now) or acting
-        if waiting.free:
-            plan = controller.plan(state, now if clock == "ideal" else now + interval)
-            if plan is not None:
-                note_plan(recording, controller, plan, waiting.begin(now, plan), task.planner.knots)
-                acting = waiting.arrived(now) or acting
-        if controller.lost:
-            recording.ended = "bad_states"
+        command = commander.command(now, sensor.seen(now, truth))
+        if command is None:
             break
-        if acting is not None:
-            command = controller.limited(command, acting.targets.at(now + interval))
         before = truth
         try:
             truth = plant.advance(np.array([command[name] for name in controller.joints]), interval)
@@ -97,7 +88,7 @@ def run_hand(controller: HandController, plant: HandPlant, seed: int, clock: Clo
             break
         if since >= task.success.goal_s - 1e-9:
             break
-    recording.late, recording.held = waiting.late, controller.held
+    commander.finish()
     return recording
 
 

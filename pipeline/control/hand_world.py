@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
 from ...datasets.models.model import Model
 from ...datasets.robots import Articulation, read_articulation
@@ -21,11 +20,10 @@ from ..physics.chain_state import with_joints
 from ..physics.checks import require_apart
 from ..physics.contact_law import ContactLaw
 from ..physics.hull import Hull
-from ..physics.paper_law import PaperLaw
 from ..physics.world import Body, State, World
 from ..sg_gs.link_hulls import Balls, link_hulls
 from .horizon import Array
-from .task_world import SOFTEST_STEPS, free_object, require_metric, require_rigid
+from .task_world import free_object, require_metric, require_rigid, softened
 
 OBJECT, LINK = "the object", "a link"
 """Materials of the object, and prefix of those of links with a friction of their own."""
@@ -71,9 +69,7 @@ class HandWorld:
         Args:
             world: A world with other parameters; None for that of the model.
         """
-        world, step = world or self.world, self.task.planner.step_s
-        laws = {pair: _soft(law, step) for pair, law in world.pair_laws.items()}
-        return replace(world, contact=_soft(world.contact, step), pair_laws=laws, step_s=step)
+        return softened(world or self.world, self.task.planner.step_s)
 
     def state(
         self,
@@ -249,10 +245,3 @@ def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body]) 
         chains=(chain,),
         source=alone.source,
     )
-
-
-def _soft(law: ContactLaw | PaperLaw, step_s: float) -> ContactLaw | PaperLaw:
-    if not isinstance(law, ContactLaw):
-        return law
-    time: Tensor = law.contact_time_s.clamp_min(SOFTEST_STEPS * step_s)
-    return replace(law, contact_time_s=time, damping_ratio=law.damping_ratio.clamp_min(1.0))

@@ -113,23 +113,12 @@ def run(controller: Controller, plant: Plant, seed: int, clock: ClockName) -> Re
     controller.restart(seed)
     truth = plant.reset(*start_of(controller.task_world, seed))
     sensor, recording = Sensor(task.plant, interval, seed), Recording(seed)
-    command = dict(zip(JOINTS, map(float, truth.finger_m), strict=True))
-    waiting, acting, within = Waiting(interval, clock), None, 0.0
+    commander, within = Commander(controller, clock, recording, task.planner.knots, truth.finger_m), 0.0
     for number in range(math.ceil(task.success.timeout_s / interval - 1e-9)):
         now = number * interval
-        acting = waiting.arrived(now) or acting
-        if waiting.free:
-            plan = controller.plan(sensor.seen(now, truth), now if clock == "ideal" else now + interval)
-            if plan is not None:
-                note_plan(recording, controller, plan, waiting.begin(now, plan), task.planner.knots)
-                acting = waiting.arrived(now) or acting
-        else:
-            sensor.seen(now, truth)
-        if controller.lost:
-            recording.ended = "bad_states"
+        command = commander.command(now, sensor.seen(now, truth))
+        if command is None:
             break
-        if acting is not None:
-            command = controller.limited(command, acting.targets.at(now + interval))
         before = truth
         try:
             truth = plant.advance(np.array([command[name] for name in JOINTS]), interval)
@@ -143,8 +132,48 @@ def run(controller: Controller, plant: Plant, seed: int, clock: ClockName) -> Re
         if good and within >= task.success.hold_s - 1e-9:
             recording.ended = "success"
             break
-    recording.late, recording.held = waiting.late, controller.held
+    commander.finish()
     return recording
+
+
+class Commander:
+    """Turns measured states into commands: makes plans, waits for them, and limits what they ask for.
+
+    Args:
+        controller: The controller.
+        clock: real or ideal.
+        recording: Takes the plans, and why the run ended where states are bad.
+        knots: Number of pieces of a plan.
+        first: Targets before the first plan acts, shape (joints,).
+    """
+
+    def __init__(
+        self, controller: PlanningController, clock: ClockName, recording: Recording, knots: int, first: Array
+    ) -> None:
+        self._controller, self._clock, self._recording, self._knots = controller, clock, recording, knots
+        self._command = dict(zip(controller.joints, map(float, first), strict=True))
+        self._waiting, self._acting = Waiting(controller.interval_s, clock), None
+
+    def command(self, now_s: float, state: ControlState) -> dict[str, float] | None:
+        """Return the targets at the end of the command that begins now; None after too many bad states."""
+        controller, interval = self._controller, self._controller.interval_s
+        self._acting = self._waiting.arrived(now_s) or self._acting
+        if self._waiting.free:
+            plan = controller.plan(state, now_s if self._clock == "ideal" else now_s + interval)
+            if plan is not None:
+                late = self._waiting.begin(now_s, plan)
+                note_plan(self._recording, controller, plan, late, self._knots)
+                self._acting = self._waiting.arrived(now_s) or self._acting
+        if controller.lost:
+            self._recording.ended = "bad_states"
+            return None
+        if self._acting is not None:
+            self._command = controller.limited(self._command, self._acting.targets.at(now_s + interval))
+        return self._command
+
+    def finish(self) -> None:
+        """Record how many plans were late, and how many states bad."""
+        self._recording.late, self._recording.held = self._waiting.late, self._controller.held
 
 
 class Waiting:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...schemas import JOINTS, NotConvergedError, UsageError
+from ...schemas import JOINTS, NotConvergedError, PlannerSection, UsageError
 from ..physics.fused.host import lacking
 from ..runtime.resources import one_torch_thread
 from .horizon import Array, Forecast, Targets
@@ -85,15 +85,20 @@ class PlanningController(ABC):
     """A controller that makes a plan from each measured state.
 
     Args:
+        planner: The section of the task that says how plans are made.
         worlds: The worlds of the predictions.
         solver: The solver.
         device: Device of the predictions.
         seed: Seed of everything random.
     """
 
-    def __init__(self, worlds: Worlds, solver: Solver, device: str, seed: int) -> None:
+    def __init__(self, planner: PlannerSection, worlds: Worlds, solver: Solver, device: str, seed: int) -> None:
         self.held = 0
         """States until now that were missing, stale or no numbers."""
+        self.interval_s = 1 / planner.control_hz
+        """Length of a command [s]."""
+        self.bad_states = planner.bad_states
+        """Bad states in a row after which a run stops."""
         self._worlds, self._solver, self._device = worlds, solver, device
         self.restart(seed)
 
@@ -101,16 +106,6 @@ class PlanningController(ABC):
     @abstractmethod
     def joints(self) -> tuple[str, ...]:
         """Names of the joints, in the order of targets."""
-
-    @property
-    @abstractmethod
-    def interval_s(self) -> float:
-        """Length of a command [s]."""
-
-    @property
-    @abstractmethod
-    def bad_states(self) -> int:
-        """Bad states in a row after which a run stops."""
 
     @abstractmethod
     def limits(self, joint: str) -> tuple[float, float, float]:

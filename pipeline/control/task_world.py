@@ -59,16 +59,7 @@ class TaskWorld:
         Args:
             world: A world with other parameters; None for that of the model.
         """
-        world, step = world or self.world, self.task.planner.step_s
-
-        def soft(law: ContactLaw | PaperLaw) -> ContactLaw | PaperLaw:
-            if not isinstance(law, ContactLaw):
-                return law
-            time, ratio = law.contact_time_s.clamp_min(SOFTEST_STEPS * step), law.damping_ratio.clamp_min(1.0)
-            return replace(law, contact_time_s=time, damping_ratio=ratio)
-
-        laws = {pair: soft(law) for pair, law in world.pair_laws.items()}
-        return replace(world, contact=soft(world.contact), pair_laws=laws, step_s=step)
+        return softened(world or self.world, self.task.planner.step_s)
 
     def pose(self, position_m: ArrayLike, turn_rad: float) -> tuple[np.ndarray, np.ndarray]:
         """Return position (3,) [m] and orientation (4,) of the object where its spheres touch the ground.
@@ -156,6 +147,19 @@ def task_world(model: Model, task: ControlTask) -> TaskWorld:
     _require_touch(found)
     _require_reach(found)
     return found
+
+
+def softened(world: World, step_s: float) -> World:
+    """Return a world for predictions in steps [s], with contacts that are soft enough for these steps."""
+
+    def soft(law: ContactLaw | PaperLaw) -> ContactLaw | PaperLaw:
+        if not isinstance(law, ContactLaw):
+            return law
+        time, ratio = law.contact_time_s.clamp_min(SOFTEST_STEPS * step_s), law.damping_ratio.clamp_min(1.0)
+        return replace(law, contact_time_s=time, damping_ratio=ratio)
+
+    laws = {pair: soft(law) for pair, law in world.pair_laws.items()}
+    return replace(world, contact=soft(world.contact), pair_laws=laws, step_s=step_s)
 
 
 def require_rigid(model: Model) -> None:
