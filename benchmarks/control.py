@@ -64,6 +64,7 @@ from cgwm.schemas import (
     Provenance,
     read_task,
 )
+from processor_clock import charge_processors
 from store import Store, shared_data
 
 OBJECTS = ("t_block", "box", "l_block", "mug")
@@ -389,7 +390,7 @@ def measure(name: str, one: Scene, seed: int, clock: str, fits: Path | None) -> 
     if isinstance(controller, Played):
         open_loop(controller, one, seed)
     if clock == "cpu":
-        _charge_processors(controller)
+        charge_processors(controller)
     before = os.getloadavg()[0]
     found = run(controller, plant, seed, "ideal" if clock == "ideal" else "real")
     wall, cpu = (1e3 * found.column(key, "plans") for key in ("wall_s", "cpu_s"))
@@ -416,17 +417,6 @@ def prepared(name: str, one: Scene, fits: Path | None) -> tuple[Controller, Mujo
     if key not in _PREPARED:
         _PREPARED[key] = contender(name, one, fits)
     return _PREPARED[key]
-
-
-def _charge_processors(controller: Controller) -> None:
-    """Let plans take the time of all processors in place of the wall time, which other processes lengthen."""
-    made = type(controller).plan
-
-    def plan(state: ControlState | None, acts_s: float | None = None) -> ControlPlan | None:
-        found = made(controller, state, acts_s)
-        return None if found is None else replace(found, wall_s=found.cpu_s)
-
-    controller.plan = plan
 
 
 def rows(store: Store) -> Iterator[list[str]]:

@@ -20,7 +20,6 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +30,9 @@ from cgwm.datasets.shapes.ply import Splats
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant
-from cgwm.pipeline.control.planning import ControlPlan, ControlState
 from cgwm.pipeline.control.solvers import Solution
 from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, Pose, Provenance
+from processor_clock import charge_processors
 from store import Store
 
 HALF_M, MASS_KG, ROUNDING_M = 0.03, 0.108, 0.004
@@ -120,7 +119,7 @@ def measure(name: str, task: HandTask, seed: int, clock: str) -> dict[str, Any]:
     if name == "hold":
         controller._solver = Hold()
     if clock == "cpu":
-        _charge_processors(controller)
+        charge_processors(controller)
     before = os.getloadavg()[0]
     found = run_hand(controller, HandScenePlant(controller.hand), seed, "ideal" if clock == "ideal" else "real")
     wall, cpu = (1e3 * found.column(key, "plans") for key in ("wall_s", "cpu_s"))
@@ -138,17 +137,6 @@ def measure(name: str, task: HandTask, seed: int, clock: str) -> dict[str, Any]:
         "plan_cpu_ms": round(float(np.median(cpu)), 1),
         "load": round(0.5 * (before + os.getloadavg()[0]), 1),
     }
-
-
-def _charge_processors(controller: HandController) -> None:
-    """Let plans take the time of all processors in place of the wall time, which other processes lengthen."""
-    made = type(controller).plan
-
-    def plan(state: ControlState | None, acts_s: float | None = None) -> ControlPlan | None:
-        found = made(controller, state, acts_s)
-        return None if found is None else replace(found, wall_s=found.cpu_s)
-
-    controller.plan = plan
 
 
 def rows(store: Store) -> Iterator[list[str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -19,11 +20,11 @@ from .engines import ENGINES, refusal
 from .materials import MATERIALS
 from .objects import OBJECTS, Item, load_item
 from .plan import FRAME_RATE
-from .pushes import plan_pushes, plan_tips
+from .pushes import PUSH, TIP, plan_strikes
 from .tosses import plan_tosses
 
 Task = Literal["fall", "push", "tip"]
-PLANS = {"fall": plan_tosses, "push": plan_pushes, "tip": plan_tips}
+PLANS = {"fall": plan_tosses, "push": partial(plan_strikes, PUSH), "tip": partial(plan_strikes, TIP)}
 TASKS: tuple[Task, ...] = ("fall", "push", "tip")
 PARTS_FILE = "truth_parts.npz"
 _SAMPLES = 2  # at each of the three moments of an exposure

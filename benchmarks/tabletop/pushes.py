@@ -60,50 +60,13 @@ class Strike:
             counts.
         offset: Largest distance of the fingertip's line from the centre of mass, in half breadths of the object.
         fault: Returns why a motion is of no use, given when the fingertip stops, where that matters.
+        rest: Returns the body direction that points down, given the object and that of its most stable rest.
     """
 
     height: tuple[float, float]
     offset: float
     fault: Callable[[Motion, float | None], str | None]
-
-
-def plan_pushes(
-    rng: np.random.Generator,
-    camera_seed: int,
-    solid: SolidObject,
-    down: Array,
-    contact: ContactTruth,
-    tests: int,
-    make: Maker = Coulomb,
-) -> tuple[tuple[EpisodePlan, ...], dict[str, int]]:
-    """Draw one push to train on and others to test on, each straight, of its own heading, offset and speed.
-
-    Args and returns are those of `plan_tosses`.
-
-    Raises:
-        NotConvergedError: If no push moves the object as wanted.
-    """
-    return _plan(Strike((0.35, 0.7), 0.4, _fault), rng, camera_seed, solid, down, contact, tests, make)
-
-
-def plan_tips(
-    rng: np.random.Generator,
-    camera_seed: int,
-    solid: SolidObject,
-    down: Array,
-    contact: ContactTruth,
-    tests: int,
-    make: Maker = Coulomb,
-) -> tuple[tuple[EpisodePlan, ...], dict[str, int]]:
-    """Draw one push that topples the object to train on and others to test on; `down` is not used, see `tall_rest`.
-
-    Args and returns are those of `plan_tosses`.
-
-    Raises:
-        NotConvergedError: If no push topples the object.
-    """
-    strike = Strike((0.9, 2.0), 0.15, _stands)
-    return _plan(strike, rng, camera_seed, solid, tall_rest(solid), contact, tests, make)
+    rest: Callable[[SolidObject, Array], Array]
 
 
 def tall_rest(solid: SolidObject) -> Array:
@@ -132,7 +95,7 @@ def tall_rest(solid: SolidObject) -> Array:
     return best[1]
 
 
-def _plan(
+def plan_strikes(
     strike: Strike,
     rng: np.random.Generator,
     camera_seed: int,
@@ -140,13 +103,16 @@ def _plan(
     down: Array,
     contact: ContactTruth,
     tests: int,
-    make: Maker,
+    make: Maker = Coulomb,
 ) -> tuple[tuple[EpisodePlan, ...], dict[str, int]]:
-    """Draw motions; see `plan_pushes`.
+    """Draw one strike to train on and others to test on, each straight, of its own heading, offset and speed.
+
+    Args and returns are those of `plan_tosses`, after `strike`, which is `PUSH` or `TIP`.
 
     Raises:
-        NotConvergedError: If no push moves the object as wanted.
+        NotConvergedError: If none moves the object as wanted.
     """
+    down = strike.rest(solid, down)
     model, cameras = build_model(solid, contact, fingertip=True), video_cameras(camera_seed).values()
     engine = make(solid, contact, True)
     rejected: Counter[str] = Counter()
@@ -248,3 +214,9 @@ def _stands(motion: Motion, stops: float | None) -> str | None:
         return "not struck"
     tilt = tilted_deg(first[3:7], last[3:7])
     return None if tilt > (_TOPPLES_DEG if stops is None else _TIPS_DEG) else "stands"
+
+
+PUSH = Strike((0.35, 0.7), 0.4, _fault, lambda _, down: down)
+"""The fingertip strikes low, and the object slides."""
+TIP = Strike((0.9, 2.0), 0.15, _stands, lambda solid, _: tall_rest(solid))
+"""The fingertip strikes high an object that stands tall, and topples it."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.datasets.shapes.meshes import Mesh
+from cgwm.datasets.shapes.meshes import mass_properties, read_mesh
 from cgwm.datasets.synthetic.dynamics import FINGERTIP, FINGERTIP_RADIUS, GRAVITY, STEPS_PER_S, ContactTruth
 from cgwm.datasets.synthetic.objects import SolidObject
 from cgwm.datasets.synthetic.plan import EpisodePlan, ScenePlan
@@ -21,7 +21,7 @@ from cgwm.pipeline.physics.world import Body, State, World
 from cgwm.pipeline.sg_gs.collision_spheres import fills_hull, shape_to_spheres
 from cgwm.schemas import FileShape, Shape
 from cgwm.schemas.materials import pair_of
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
@@ -50,19 +50,19 @@ class Spheres:
 
 def spheres_of(solid: SolidObject) -> Spheres:
     """Fill a true object with spheres as `cgwm fit` does with a mesh."""
-    mesh = Mesh(solid.vertices, solid.faces)
     with tempfile.TemporaryDirectory() as folder:
-        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
-        lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in solid.vertices.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (solid.faces + 1).tolist()]
         (Path(folder) / "object.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        found, distance = shape_to_spheres(Shape(mesh=FileShape(path="object.obj")), Path(folder), SPHERES, 1.0)
+        return spheres_in(Path(folder), "object.obj")
+
+
+def spheres_in(folder: Path, mesh: str) -> Spheres:
+    """Fill the solid of a mesh file in a folder with spheres as `cgwm fit` does."""
+    found, distance = shape_to_spheres(Shape(mesh=FileShape(path=mesh)), folder, SPHERES, 1.0)
     centers, radii = np.asarray(found.means, np.float64), np.asarray(found.scales, np.float64)
-    volume = float(np.einsum("fi,fi->", mesh.vertices[mesh.faces[:, 0]], np.cross(*_edges(mesh))) / 6)
+    volume = mass_properties(read_mesh(folder / mesh)).volume_m3
     return Spheres(centers, radii, fills_hull(centers, radii, volume), float(distance))
-
-
-def _edges(mesh: Mesh) -> tuple[Array, Array]:
-    return mesh.vertices[mesh.faces[:, 1]], mesh.vertices[mesh.faces[:, 2]]
 
 
 @dataclass(frozen=True)
@@ -73,36 +73,47 @@ class Numbers:
     damping_ratio: float
 
 
-def true_world(solid: SolidObject, spheres: Spheres, contact: ContactTruth, fingertip: bool, numbers: Numbers) -> World:
-    """Return the world of true shape, mass and frictions under given numbers of the law."""
-
-    def tensor(value: object) -> torch.Tensor:
-        return torch.as_tensor(np.asarray(value), dtype=torch.float64)[None]
-
-    def law(friction: float) -> ContactLaw:
-        return ContactLaw(tensor(friction), tensor(numbers.contact_time_s), tensor(numbers.damping_ratio))
-
-    centers, radii = tensor(spheres.centers), tensor(spheres.radii)
+def true_body(spheres: Spheres, mass_kg: float, com_m: ArrayLike, inertia_kg_m2: ArrayLike) -> Body:
+    """Return the object as a body with its true numbers; the inertia has shape (3, 3)."""
+    centers, radii = _tensor(spheres.centers), _tensor(spheres.radii)
     on_plane = plane_contacts(centers[0], radii[0])
-    thing = Body(
-        name=OBJECT, motion="free", mass=tensor(solid.mass), inertia=tensor(solid.inertia), com=tensor(solid.com),
+    return Body(
+        name=OBJECT, motion="free", mass=_tensor(mass_kg), inertia=_tensor(inertia_kg_m2), com=_tensor(com_m),
         centers=centers, radii=radii, on_plane=on_plane, material=OBJECT,
         hull=Hull.of(centers[0], radii[0], on_plane) if spheres.convex else None,
     )  # fmt: skip
+
+
+def on_true_ground(world: World, friction: float, friction_fingertip: float | None, numbers: Numbers) -> World:
+    """Return a world whose frictions are those of the ground and of the fingertip, where there is one [1]."""
+    pairs = {} if friction_fingertip is None else {pair_of(OBJECT, FINGERTIP): _law(friction_fingertip, numbers)}
+    bodies = tuple(replace(one, material=one.name) for one in world.bodies)
+    return replace(world, bodies=bodies, contact=_law(friction, numbers), pair_laws=pairs, ground_material=GROUND)
+
+
+def true_world(solid: SolidObject, spheres: Spheres, contact: ContactTruth, fingertip: bool, numbers: Numbers) -> World:
+    """Return the world of true shape, mass and frictions under given numbers of the law."""
     tip = Body(
-        name=FINGERTIP, motion="driven", mass=tensor(1.0), inertia=tensor(np.eye(3)), com=tensor(np.zeros(3)),
-        centers=tensor(np.zeros((1, 3))), radii=tensor(np.full(1, FINGERTIP_RADIUS)), material=FINGERTIP,
+        name=FINGERTIP, motion="driven", mass=_tensor(1.0), inertia=_tensor(np.eye(3)), com=_tensor(np.zeros(3)),
+        centers=_tensor(np.zeros((1, 3))), radii=_tensor(np.full(1, FINGERTIP_RADIUS)),
     )  # fmt: skip
-    on_ground = law(contact.friction)
-    return World(
+    thing = true_body(spheres, solid.mass, solid.com, solid.inertia)
+    world = World(
         bodies=(thing, tip) if fingertip else (thing,),
-        gravity=tensor([0.0, 0.0, -GRAVITY]),
-        ground_normal=tensor([0.0, 0.0, 1.0])[0],
-        ground_offset=tensor(0.0),
-        contact=on_ground,
-        pair_laws={pair_of(OBJECT, FINGERTIP): law(contact.friction_fingertip)} if fingertip else {},
-        ground_material=GROUND,
+        gravity=_tensor([0.0, 0.0, -GRAVITY]),
+        ground_normal=_tensor([0.0, 0.0, 1.0])[0],
+        ground_offset=_tensor(0.0),
+        contact=_law(contact.friction, numbers),
     )
+    return on_true_ground(world, contact.friction, contact.friction_fingertip if fingertip else None, numbers)
+
+
+def _law(friction: float, numbers: Numbers) -> ContactLaw:
+    return ContactLaw(_tensor(friction), _tensor(numbers.contact_time_s), _tensor(numbers.damping_ratio))
+
+
+def _tensor(value: ArrayLike) -> torch.Tensor:
+    return torch.as_tensor(np.asarray(value), dtype=torch.float64)[None]
 
 
 def pose_errors(world: World, plan: ScenePlan, episode: EpisodePlan) -> tuple[float, float]:

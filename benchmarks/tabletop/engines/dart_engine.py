@@ -7,7 +7,6 @@ its own collision detector knows no other convex parts, and corners as small sph
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -16,15 +15,12 @@ from cgwm.datasets.synthetic.dynamics import (
     FINGERTIP,
     FINGERTIP_RADIUS,
     GRAVITY,
-    ContactTruth,
-    Motion,
     matrix_from_quat,
     quat_from_matrix,
 )
 from cgwm.datasets.synthetic.hidden_effects.things import restitution_of
-from cgwm.datasets.synthetic.objects import SolidObject
 
-from .stepper import STEP_S, Array, recorded
+from .stepper import STEP_S, Array, Stepper, Stepping
 
 _CARRIER_KG = 1e-9
 """Mass of the link between the sliding axes and the ball joint, which weighs nothing."""
@@ -37,19 +33,12 @@ def is_box(part: Array) -> bool:
     return len(part) == 8 and bool(np.allclose(np.abs(part - middle), half))
 
 
-@dataclass(frozen=True)
-class Dart:
+class Dart(Stepping):
     """DART's world."""
 
-    solid: SolidObject
-    contact: ContactTruth
-    fingertip: bool
-
-    def simulate(
-        self, qpos: Array, qvel: Array, start: float, end: float, command: tuple[Array, Array] | None = None
-    ) -> Motion:
-        """See `Engine`."""
-        return recorded(_Run(self, qpos, qvel), self.solid, start, end, command)
+    def begin(self, qpos: Array, qvel: Array) -> Stepper:
+        """See `Stepping`."""
+        return _Run(self, qpos, qvel)
 
 
 class _Run:

@@ -6,19 +6,17 @@ at the corners of the object's hull, which are all of it that a plane can touch,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 import numpy as np
-from cgwm.datasets.synthetic.dynamics import FINGERTIP, FINGERTIP_RADIUS, GRAVITY, ContactTruth, Motion
+from cgwm.datasets.synthetic.dynamics import FINGERTIP, FINGERTIP_RADIUS, GRAVITY
 from cgwm.datasets.synthetic.hidden_effects.rotation import rotation_of
 from cgwm.datasets.synthetic.hidden_effects.things import restitution_of
-from cgwm.datasets.synthetic.objects import SolidObject
 from hidden_effects.drake_engine import dissipation_of
 
 from .hull_corners import CORNER_RADIUS_M, corner_spheres
-from .stepper import STEP_S, Array, recorded
+from .stepper import STEP_S, Array, Stepper, Stepping
 
 _STEPS = 2
 """Drake's steps in one of the record: they are implicit, and damp a contact the more, the longer they are."""
@@ -29,19 +27,12 @@ _FINGERTIP_KG = 1e4
 """So heavy that contact does not deflect it within a step."""
 
 
-@dataclass(frozen=True)
-class Drake:
+class Drake(Stepping):
     """Drake's discrete plant."""
 
-    solid: SolidObject
-    contact: ContactTruth
-    fingertip: bool
-
-    def simulate(
-        self, qpos: Array, qvel: Array, start: float, end: float, command: tuple[Array, Array] | None = None
-    ) -> Motion:
-        """See `Engine`."""
-        return recorded(_Run(self, qpos, qvel), self.solid, start, end, command)
+    def begin(self, qpos: Array, qvel: Array) -> Stepper:
+        """See `Stepping`."""
+        return _Run(self, qpos, qvel)
 
 
 class _Run:

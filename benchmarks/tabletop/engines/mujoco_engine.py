@@ -15,7 +15,7 @@ from cgwm.datasets.synthetic.dynamics import (
 )
 from cgwm.datasets.synthetic.objects import SolidObject
 
-from .stepper import Array, recorded
+from .stepper import Array, Stepper, Stepping
 
 
 @dataclass(frozen=True)
@@ -34,22 +34,15 @@ class Coulomb:
         return simulate(model, qpos, qvel, start, end, command)
 
 
-@dataclass(frozen=True)
-class Default:
+class Default(Stepping):
     """What a user gets who writes down shapes, masses and sliding friction, and nothing else.
 
     Contacts of 20 ms that are critically damped (`solref` 0.02 1), pyramidal cones, `impratio` 1, `implicitfast`; the
     ground's restitution is lost.
     """
 
-    solid: SolidObject
-    contact: ContactTruth
-    fingertip: bool
-
-    def simulate(
-        self, qpos: Array, qvel: Array, start: float, end: float, command: tuple[Array, Array] | None = None
-    ) -> Motion:
-        """See `Engine`."""
+    def begin(self, qpos: Array, qvel: Array) -> Stepper:
+        """See `Stepping`."""
         model = build_model(self.solid, self.contact, self.fingertip)
         model.opt.timestep = 1 / STEPS_PER_S
         model.opt.integrator, model.opt.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_PYRAMIDAL
@@ -57,7 +50,7 @@ class Default:
         model.pair_solref[:] = (0.02, 1.0)
         model.pair_solreffriction[:] = 0.0
         model.pair_solimp[:] = (0.9, 0.95, 0.001, 0.5, 2.0)
-        return recorded(_Run(model, qpos, qvel), self.solid, start, end, command)
+        return _Run(model, qpos, qvel)
 
 
 class _Run:

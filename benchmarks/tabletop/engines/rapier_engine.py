@@ -6,32 +6,24 @@ which is at random, and adds up to some micrometres in two seconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 import numpy as np
-from cgwm.datasets.synthetic.dynamics import FINGERTIP_RADIUS, GRAVITY, ContactTruth, Motion, matrix_from_quat
+from cgwm.datasets.synthetic.dynamics import FINGERTIP_RADIUS, GRAVITY, matrix_from_quat
 from cgwm.datasets.synthetic.hidden_effects.things import restitution_of
 from cgwm.datasets.synthetic.objects import SolidObject
 from scipy.spatial.transform import Rotation
 
-from .stepper import STEP_S, Array, recorded
+from .stepper import STEP_S, Array, Stepper, Stepping
 
 
-@dataclass(frozen=True)
-class Rapier:
+class Rapier(Stepping):
     """Rapier's world."""
 
-    solid: SolidObject
-    contact: ContactTruth
-    fingertip: bool
-
-    def simulate(
-        self, qpos: Array, qvel: Array, start: float, end: float, command: tuple[Array, Array] | None = None
-    ) -> Motion:
-        """See `Engine`."""
-        return recorded(_Run(self, qpos, qvel), self.solid, start, end, command)
+    def begin(self, qpos: Array, qvel: Array) -> Stepper:
+        """See `Stepping`."""
+        return _Run(self, qpos, qvel)
 
 
 class _Run:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from cgwm.datasets.synthetic.dynamics import STEPS_PER_S, Motion, matrix_from_quat
+from cgwm.datasets.synthetic.dynamics import STEPS_PER_S, ContactTruth, Motion, matrix_from_quat
 from cgwm.datasets.synthetic.objects import SolidObject
 from numpy.typing import NDArray
 
@@ -42,6 +44,31 @@ class Stepper(Protocol):
     def advance(self) -> None:
         """Go on by `STEP_S`."""
         ...
+
+
+@dataclass(frozen=True)
+class Stepping(ABC):
+    """An engine that records the steps of a stepper.
+
+    Args:
+        solid: The object.
+        contact: Its contact.
+        fingertip: Whether there is a fingertip.
+    """
+
+    solid: SolidObject
+    contact: ContactTruth
+    fingertip: bool
+
+    @abstractmethod
+    def begin(self, qpos: Array, qvel: Array) -> Stepper:
+        """Return a motion in its first state."""
+
+    def simulate(
+        self, qpos: Array, qvel: Array, start: float, end: float, command: tuple[Array, Array] | None = None
+    ) -> Motion:
+        """See `Engine`."""
+        return recorded(self.begin(qpos, qvel), self.solid, start, end, command)
 
 
 def recorded(
