@@ -55,7 +55,7 @@ def demo(
         with loading():
             from ..pipeline.demo import run_control_demo
 
-        emit(run_control_demo(out, seed, device, overwrite), lambda result: _control(result, out))
+        emit(run_control_demo(out, seed, device, overwrite), lambda result: _fitted(result, out))
         return
     if scene in ("bin", "ramp"):
         with loading():
@@ -93,29 +93,22 @@ def _story(result: MysteryResult, out: Path) -> str:
     return "\n".join([*lines, f"Report: {out / result.paths['report']}"])
 
 
-def _control(result: ControlDemoResult, out: Path) -> str:
+def _world(result: WorldDemoResult, out: Path) -> str:
+    from .output import millimetres
+
+    error = millimetres(result.evaluation.translation_error_m.median)
+    return _fitted(result, out, f"{error} open-loop error on {result.evaluation.episodes} test episodes (median).")
+
+
+def _fitted(result: ControlDemoResult | WorldDemoResult, out: Path, *figures: str) -> str:
+    """Return verdict, fitted parameters beside the truth, further figures, time and warnings."""
     from .output import table, warnings
 
     rows = [_row(p) for p in result.parameters if p.parameter.state == "fitted"]
     lines = [
         result.verdict,
         table(rows, ["parameter", "estimate", "95 % interval", "truth", "unit"]),
-        f"{sum(result.seconds.values()):.0f} s.",
-        *warnings(result.warnings),
-        f"Report: {out / result.paths['report']}",
-    ]
-    return "\n".join(lines)
-
-
-def _world(result: WorldDemoResult, out: Path) -> str:
-    from .output import millimetres, table, warnings
-
-    rows = [_row(p) for p in result.parameters if p.parameter.state == "fitted"]
-    error = millimetres(result.evaluation.translation_error_m.median)
-    lines = [
-        result.verdict,
-        table(rows, ["parameter", "estimate", "95 % interval", "truth", "unit"]),
-        f"{error} open-loop error on {result.evaluation.episodes} test episodes (median).",
+        *figures,
         f"{sum(result.seconds.values()):.0f} s.",
         *warnings(result.warnings),
         f"Report: {out / result.paths['report']}",

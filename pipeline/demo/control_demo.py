@@ -10,7 +10,6 @@ from ...datasets.synthetic import make_scene, plan_scene, read_truth
 from ...datasets.synthetic.dynamics import FINGERTIP, FINGERTIP_RADIUS
 from ...datasets.synthetic.objects import write_parts
 from ...schemas import (
-    CalibrateConfig,
     CalibrationReport,
     ControlDemoResult,
     ControlResult,
@@ -18,7 +17,6 @@ from ...schemas import (
     ModelFile,
     PhysConfig,
     SlowPlansError,
-    SplatConfig,
     task_toml,
 )
 from ..calibrate.stage import calibrate
@@ -28,6 +26,7 @@ from ..fit import fit
 from ..runtime.device import resolve_device
 from ..runtime.timing import StagedRun
 from .control_page import REPORT_HTML, REPORT_JSON, control_demo_html
+from .filmed_settings import FilmedSettings
 from .truth_tables import compare_parameters
 
 TASK, TRUTH, RUNS = "push.toml", "true_parts", "runs"
@@ -36,19 +35,11 @@ SHOWN = ("friction", "contact_time_s", "damping_ratio", "ground_offset_m")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ControlDemoSettings:
+class ControlDemoSettings(FilmedSettings):
     """Sizes and settings of the stages; the demo fills in seed and device."""
 
     photos: int = 32
     """Number of photos of the scene."""
-    photo_size: tuple[int, int] = (640, 480)
-    """Width and height of a photo [px]."""
-    video_size: tuple[int, int] = (480, 360)
-    """Width and height of a video frame [px]."""
-    calibrate: CalibrateConfig = field(default_factory=lambda: CalibrateConfig(max_features=2048))
-    """Settings of `calibrate`."""
-    splats: SplatConfig = field(default_factory=SplatConfig)
-    """Settings of the stage sg-gs."""
     physics: PhysConfig = field(
         default_factory=lambda: PhysConfig(supervise="images", population=48, generations=5, iterations=6)
     )

@@ -36,6 +36,7 @@ from ..runtime.device import resolve_device
 from ..runtime.timing import StagedRun
 from ..synthesize.stage import synthesize
 from .episode_section import curves_of
+from .filmed_settings import FilmedSettings
 from .page import REPORT_HTML, REPORT_JSON, ReportPictures, write_report
 from .truth_tables import check_calibration, check_splats, compare_parameters
 from .verdict import targets_of, verdict_text
@@ -61,19 +62,11 @@ _SHOWN_AT = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoSettings:
+class DemoSettings(FilmedSettings):
     """Sizes and settings of the stages; the demo fills in seed and device."""
 
     photos: int = 48
     """Number of photos of the scene."""
-    photo_size: tuple[int, int] = (640, 480)
-    """Width and height of a photo [px]."""
-    video_size: tuple[int, int] = (480, 360)
-    """Width and height of a video frame [px]."""
-    calibrate: CalibrateConfig = field(default_factory=lambda: CalibrateConfig(max_features=2048))
-    """Settings of `calibrate`."""
-    splats: SplatConfig = field(default_factory=SplatConfig)
-    """Settings of the stage sg-gs."""
     physics: PhysConfig = field(default_factory=PhysConfig)
     """Settings of the stage phys-geo."""
     images: PhysConfig = field(default_factory=lambda: PhysConfig(population=48, generations=5, iterations=6))
