@@ -2,7 +2,14 @@
 
 from .articulations import Articulation, ArticulationModel, JointModel
 from .base import FileModel, parse, read_json, read_toml
-from .calibration import CalibrationAttempt, CalibrationReport, ImageVerdict, PairFigures, SelfCheckFigures
+from .calibration import (
+    CalibrationAttempt,
+    CalibrationReport,
+    FocalFigures,
+    ImageVerdict,
+    PairFigures,
+    SelfCheckFigures,
+)
 from .cameras import CAMERAS_FORMAT, CameraIntrinsics, CamerasFile, PosedImage, PosedVideo, Scale
 from .capture import (
     CAPTURE_FORMAT,
@@ -228,6 +235,7 @@ __all__ = [
     "FitFile",
     "FittedParameter",
     "FlightTest",
+    "FocalFigures",
     "Ground",
     "HandPlantSection",
     "HandTask",

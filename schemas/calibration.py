@@ -71,6 +71,21 @@ class CalibrationAttempt(FileModel):
     outcome: Literal["taken", "passed", "self_check_failed", "no_model"]
 
 
+class FocalFigures(FileModel):
+    """The focal length of a camera whose photos have one in their EXIF data."""
+
+    px: float
+    """That of cameras.json: the mean of the two below, weighted by their information [px]."""
+    exif_px: float
+    """From the EXIF data, taken to be right within 3 % (one standard deviation)."""
+    matches_px: float
+    """From the matches of all photos."""
+    matches_std_percent: float
+    """Standard deviation of the latter [%], at most 100."""
+    exif_used: bool
+    """False where the two contradict each other: the matches alone count."""
+
+
 class CalibrationReport(FileModel):
     """`calibration.json`."""
 
@@ -89,6 +104,8 @@ class CalibrationReport(FileModel):
     attempts: tuple[CalibrationAttempt, ...]
     center_std_percent: float | None = None
     """Median over the registered images of the standard deviation of the optical centre [% of the centres' extent]."""
+    focal_lengths: dict[str, FocalFigures] = {}
+    """By camera, where the EXIF data name a focal length and the intrinsics were estimated."""
     scale: Scale
     world_frame: str
     """Where the axes and the origin come from, in words."""
@@ -113,6 +130,12 @@ class CalibrationReport(FileModel):
             f"{self.points} points, reprojection {self.reprojection_error_px:.2f} px, {self.wall_time_s:.0f} s",
             f"self-check: {_passed(self.self_check)}",
             *(f"camera model: {one.camera_model}" for one in self.attempts if one.outcome == "taken"),
+            *(
+                f"focal length of '{camera}': {one.px:.0f} px (matches {one.matches_px:.0f} +- "
+                f"{one.matches_std_percent:.2g} %, EXIF {one.exif_px:.0f} +- 3 %)"
+                for camera, one in self.focal_lengths.items()
+                if one.exif_used
+            ),
             *self._centers(),
         ]
         if self.videos:

@@ -12,8 +12,10 @@ from ...schemas import CalibrateConfig, NotConvergedError
 from ...schemas.calibration import CalibrationAttempt, ImageVerdict, PairFigures, SelfCheckFigures
 from . import colmap
 from .camera_models import FIRST_TRIED, LADDER, richer, supported
+from .center_uncertainty import focal_stds
 from .consistency_check import SelfCheck, check_model
-from .mapping import Mapped, adjusted, map_database, without_outliers
+from .focal_prior import FocalLength, focal_lengths
+from .mapping import Mapped, adjusted, map_database, with_focal_lengths, without_outliers
 from .photos import Inputs
 from .reconstruction import SfmModel, VerifiedPair
 
@@ -42,6 +44,8 @@ class Candidate:
     """Verified pairs of images."""
     features: dict[str, int]
     """Number of features by image."""
+    focals: dict[str, FocalLength]
+    """Focal lengths of the cameras with EXIF data, by camera."""
     attempt: int
     """Number of the attempt."""
 
@@ -119,14 +123,18 @@ def _attempt(
                 path.rename(folder / path.name.replace(f"-{number - 1}.", f"-{number}."))
     else:
         colmap.build_database(database, inputs.root, [source.image for source in inputs.sources], settings)
+    exif_px = colmap.exif_focals_px(database)
     models, camera_model = _models(database, inputs, settings.seed)
+    focals: dict[str, FocalLength] = {}
+    if models:
+        models[0], focals = _with_exif(models[0], camera_model, exif_px, inputs, settings.seed)
     pairs = tuple(
         replace(pair, image_a=names[pair.image_a], image_b=names[pair.image_b]) for pair in colmap.read_pairs(database)
     )
     candidate = None
     if models:
         features = {names[name]: count for name, count in colmap.feature_counts(database).items()}
-        named = tuple(model.renamed(names) for model in models)
+        named = tuple(one.model().renamed(names) for one in models)
         candidate = Candidate(
             model=named[0],
             camera_model=camera_model,
@@ -134,12 +142,13 @@ def _attempt(
             models=named,
             pairs=pairs,
             features=features,
+            focals=focals,
             attempt=number,
         )
     return candidate, _attempt_figures(settings, candidate)
 
 
-def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[SfmModel], str]:
+def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[Mapped], str]:
     """Return the connected models of the camera model that registers most images, the largest refined; and which it is.
 
     The mapping tries camera models from simple ones on until all images are registered. Of the largest model, cameras
@@ -163,7 +172,27 @@ def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[SfmModel], 
     free = len(set(best[0].names.values()) - set(inputs.known))
     taken = supported([(model, step.residuals_px()) for model, step in steps], free)
     largest = without_outliers(dict(steps)[taken], inputs.known, seed)
-    return [largest.model(), *(one.model() for one in best[1:])], taken
+    return [largest, *best[1:]], taken
+
+
+def _with_exif(
+    mapped: Mapped, camera_model: str, exif_px: dict[str, float], inputs: Inputs, seed: int
+) -> tuple[Mapped, dict[str, FocalLength]]:
+    """Return a model whose focal lengths heed the EXIF data too, as far as the matches leave them open, and these."""
+    model = mapped.model()
+    models = estimated(camera_model, model, inputs)
+    if not set(models) & set(exif_px):
+        return mapped, {}
+    matches_px = {camera: model.cameras[camera].focal_px for camera in models}
+    focals = focal_lengths(exif_px, matches_px, focal_stds(model, models))
+    combined = {camera: focal.combined_px for camera, focal in focals.items() if focal.agree}
+    return with_focal_lengths(mapped, combined, inputs.known, seed) if combined else mapped, focals
+
+
+def estimated(camera_model: str, model: SfmModel, inputs: Inputs) -> dict[str, str]:
+    """Return the camera model of each camera of a model whose intrinsics were estimated."""
+    used = set(model.image_camera.values()) - set(inputs.known)
+    return {camera: name for camera, name in limited(camera_model, inputs).items() if camera in used}
 
 
 def limited(model: str, inputs: Inputs) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""How far the camera centres of a model may be off, from the normal equations of its bundle adjustment.
+"""How far camera centres and focal lengths of a model may be off, from the normal equations of its bundle adjustment.
 
 The covariance of least squares counts the errors of all matches as independent. They are not: a feature's place shifts
 with the direction from which it is seen, by hundredths of a pixel, and all features of a surface shift alike. Through
@@ -9,12 +9,14 @@ shared errors is added, in the pattern that moves the cameras most.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from collections.abc import Mapping as Map
 
 import numpy as np
 from scipy import sparse
 
 from .camera_models import LENS_PARAMETERS
+from .focal_prior import EXIF_STD
 from .mapping import noise_px
 from .reconstruction import Array, SfmCamera, SfmModel, distort
 from .triangulation import cross_matrices, projection_jacobian
@@ -27,7 +29,7 @@ _RIDGE = 1e-12
 """Relative weight that keeps a point with parallel rays from an infinite covariance."""
 
 
-def center_stds(model: SfmModel, models: Map[str, str]) -> dict[str, float]:
+def center_stds(model: SfmModel, models: Map[str, str], with_exif: Collection[str] = ()) -> dict[str, float]:
     """Return the standard deviation of each optical centre, after the best similarity alignment of all centres.
 
     With H the normal matrix of poses and intrinsics after elimination of the points, and C the displacements of the
@@ -39,23 +41,44 @@ def center_stds(model: SfmModel, models: Map[str, str]) -> dict[str, float]:
     Args:
         model: The model.
         models: COLMAP's camera model of each camera whose intrinsics were estimated.
+        with_exif: Those cameras among them whose focal length EXIF data have told, too.
 
     Returns:
         Standard deviation by image, as a fraction of the diagonal of the box around all centres; infinite where the
         observations do not determine the cameras.
     """
-    images = list(model.T_cam_world)
-    normal, count, noise = _reduced_normal_matrix(model, images, models)
+    variances, _ = _variances(model, models, with_exif)
     centers = model.centers()
     extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
-    variance = _center_variances(normal, centers, extent) * (noise**2 + 2 * count * SHARED_ERROR_PX**2)
-    return {image: float(np.sqrt(value)) for image, value in zip(images, variance, strict=True)}
+    sums = variances[: _POSE * len(centers)].reshape(-1, _POSE)[:, :3].sum(1) / extent**2
+    return {image: _root(value) for image, value in zip(model.T_cam_world, sums, strict=True)}
 
 
-def _center_variances(normal: Array, centers: Array, extent: float) -> Array:
-    """Return the trace of each centre's block of the inverse under inner constraints, in units of extent squared."""
+def focal_stds(model: SfmModel, models: Map[str, str]) -> dict[str, float]:
+    """Return the relative standard deviation of the focal length of each camera in `models`, from the matches alone."""
+    variances, columns = _variances(model, models, ())
+    # of OPENCV's two focal lengths the first stands for both: the pixels of photos are square
+    return {name: _root(variances[columns[name]]) / model.cameras[name].focal_px for name in columns}
+
+
+def _root(variance: float) -> float:
+    return float(np.sqrt(variance)) if variance > 0 else np.inf
+
+
+def _variances(model: SfmModel, models: Map[str, str], with_exif: Collection[str]) -> tuple[Array, dict[str, int]]:
+    """Return the variances of poses and intrinsics under inner constraints, and the column of each focal length."""
+    normal, columns, count, noise = _reduced_normal_matrix(model, list(model.T_cam_world), models)
+    shared = noise**2 + 2 * count * SHARED_ERROR_PX**2
+    for name in with_exif:
+        normal[columns[name], columns[name]] += shared / (EXIF_STD * model.cameras[name].focal_px) ** 2
+    return _inverse_diagonal(normal, model.centers()) * shared, columns
+
+
+def _inverse_diagonal(normal: Array, centers: Array) -> Array:
+    """Return the diagonal of the inverse of a normal matrix under inner constraints on the centres (image, 3)."""
     size, count = len(normal), len(centers)
     gauge = np.zeros((size, 7))
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
     away = (centers - centers.mean(0)) / max(extent, np.finfo(float).tiny)
     rows = (_POSE * np.arange(count)[:, None] + np.arange(3)).ravel()
     gauge[rows, :3] = np.tile(np.eye(3), (count, 1))
@@ -66,20 +89,22 @@ def _center_variances(normal: Array, centers: Array, extent: float) -> Array:
     gauge /= np.maximum(np.linalg.norm(gauge, axis=0), np.finfo(float).tiny)
     bordered = np.block([[normal * scale[:, None] * scale, gauge], [gauge.T, np.zeros((7, 7))]])
     try:
-        inverse = np.linalg.inv(bordered)
+        return np.diag(np.linalg.inv(bordered))[:size] * scale**2
     except np.linalg.LinAlgError:
-        return np.full(count, np.inf)
-    variance = (np.diag(inverse)[:size] * scale**2)[rows].reshape(count, 3).sum(1) / extent**2
-    return np.where(variance > 0, variance, np.inf)
+        return np.full(size, np.inf)
 
 
-def _reduced_normal_matrix(model: SfmModel, images: list[str], models: Map[str, str]) -> tuple[Array, int, float]:
-    """Return the normal matrix of poses and intrinsics without the points, the observations, and their noise [px].
+def _reduced_normal_matrix(
+    model: SfmModel, images: list[str], models: Map[str, str]
+) -> tuple[Array, dict[str, int], int, float]:
+    """Return the normal matrix of poses and intrinsics without the points, and what belongs to it.
 
+    That is the first column of the intrinsics of each camera, the number of observations, and their noise [px].
     The 6 numbers of a pose are the shift of its centre, world axes, and its rotation, camera axes; those of the cameras
     with estimated intrinsics follow.
     """
-    first, size = {}, _POSE * len(images)
+    first: dict[str, int] = {}
+    size = _POSE * len(images)
     for camera, name in models.items():
         first[camera], size = size, size + LENS_PARAMETERS[name]
     normal, points = np.zeros((size, size)), np.zeros((len(model.points), 3, 3))
@@ -104,7 +129,8 @@ def _reduced_normal_matrix(model: SfmModel, images: list[str], models: Map[str, 
     eliminated = (coupling @ inverse @ coupling.T).toarray()
     residuals = np.concatenate(lengths)
     freedom = 2 * len(residuals) - size - 3 * len(points)
-    return normal - eliminated, len(residuals), noise_px(residuals) * np.sqrt(2 * len(residuals) / max(freedom, 1))
+    noise = noise_px(residuals) * np.sqrt(2 * len(residuals) / max(freedom, 1))
+    return normal - eliminated, first, len(residuals), noise
 
 
 def _jacobians(model: SfmModel, image: str, lens: str | None) -> tuple[Array, Array, Array, Array]:

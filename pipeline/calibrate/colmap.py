@@ -130,6 +130,21 @@ def feature_counts(database: Path) -> dict[str, int]:
     )
 
 
+def exif_focals_px(database: Path) -> dict[str, float]:
+    """Return the focal length [px] of each camera whose first photo has one in its EXIF data.
+
+    COLMAP takes it from the 35 mm equivalent, from the resolution of the sensor, or from its list of cameras. To be
+    read before a mapping, which writes its own cameras.
+    """
+    names = camera_names(database)
+    cameras = count(database, lambda opened: opened.read_all_cameras())
+    return {
+        names[camera.camera_id]: float(camera.mean_focal_length())
+        for camera in cameras
+        if camera.has_prior_focal_length
+    }
+
+
 def _extract(database: Path, root: Path, images: Sequence[SfmImage], settings: SfmSettings) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = 1

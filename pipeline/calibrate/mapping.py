@@ -107,6 +107,20 @@ def adjusted(mapped: Mapped, models: Map[str, str], known: Map[str, CameraIntrin
     return Mapped(reconstruction=copy, names=mapped.names)
 
 
+def with_focal_lengths(
+    mapped: Mapped, focals_px: Map[str, float], known: Map[str, CameraIntrinsics], seed: int
+) -> Mapped:
+    """Give cameras of an adjusted model their focal lengths [px], and adjust all but focal lengths again."""
+    copy = pycolmap.Reconstruction(mapped.reconstruction)
+    for identifier, camera in copy.cameras.items():
+        if mapped.names[identifier] in focals_px:
+            values = np.array(camera.params)
+            values[camera.focal_length_idxs()] *= focals_px[mapped.names[identifier]] / camera.mean_focal_length()
+            camera.params = values.tolist()
+    _adjust(copy, _fixed(mapped, known), seed, focal_lengths=False)
+    return Mapped(reconstruction=copy, names=mapped.names)
+
+
 def without_outliers(mapped: Mapped, known: Map[str, CameraIntrinsics], seed: int) -> Mapped:
     """Drop the observations of an adjusted model that are taken for wrong matches, and adjust it again, twice."""
     copy = pycolmap.Reconstruction(mapped.reconstruction)
@@ -181,10 +195,11 @@ def _fixed(mapped: Mapped, known: Map[str, CameraIntrinsics]) -> set[int]:
     return {identifier for identifier in mapped.reconstruction.cameras if mapped.names[identifier] in known}
 
 
-def _adjust(reconstruction: Any, fixed: set[int], seed: int) -> None:
+def _adjust(reconstruction: Any, fixed: set[int], seed: int, focal_lengths: bool = True) -> None:
     lengths = np.concatenate([lengths for _, _, lengths in _residuals(reconstruction)])
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
+    options.refine_focal_length = focal_lengths
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _LOSS_SCALE * noise_px(lengths)
     options.ceres.solver_options.num_threads = 1

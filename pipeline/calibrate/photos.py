@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections import Counter
+from collections.abc import Mapping as Map
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.capture.capture import Capture
+from ...datasets.capture.exif import photo_lens
 from ...datasets.capture.images import image_size, write_image
 from ...schemas import CameraIntrinsics, InputDataError
 from .colmap import SfmImage
@@ -138,6 +141,7 @@ def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str], dict
     sizes = {name: image_size(capture.root / "images" / name) for name in names}
     distinct = sorted(set(sizes.values()))
     same = capture.manifest.calibration.same_camera
+    lenses = _lenses(capture) if same else {}
     sources, richest = [], {}
     for index, name in enumerate(names):
         # Numbers replace the names, because COLMAP separates lists by blanks.
@@ -145,14 +149,37 @@ def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str], dict
         _link(capture.root / "images" / name, root / inside)
         width, height = sizes[name]
         camera = name if not same else "photos" if len(distinct) == 1 else f"photos-{width}x{height}"
-        alike = sum(size == sizes[name] for size in sizes.values()) if same else 1
+        camera += f"-lens{lenses[name]}" if lenses else ""
+        alike = sum(_alike(one, name, sizes, lenses) for one in names) if same else 1
         richest[camera] = "OPENCV" if alike >= _FEW_PHOTOS else "SIMPLE_RADIAL"
         sources.append(Source(name, SfmImage(inside, camera)))
     notes = []
     if same and len(distinct) > 1:
         listed = ", ".join(f"{width}x{height}" for width, height in distinct)
         notes.append(f"photos of {len(distinct)} sizes ({listed}): each size has separate intrinsics")
+    if lenses:
+        notes.append(
+            f"the EXIF data name {len(set(lenses.values()))} lenses or focal lengths: each has separate intrinsics; "
+            "photos with one focal length are calibrated best"
+        )
     return sources, notes, richest
+
+
+def _alike(one: str, other: str, sizes: Map[str, tuple[int, int]], lenses: Map[str, int]) -> bool:
+    return sizes[one] == sizes[other] and lenses.get(one) == lenses.get(other)
+
+
+def _lenses(capture: Capture) -> dict[str, int]:
+    """Return the number of the lens of each photo, from 1, by EXIF data; nothing where all have one.
+
+    Photos without EXIF data count as of the lens of most others.
+    """
+    texts = {name: photo_lens(capture.root / "images" / name) for name in capture.photos()}
+    counts = Counter(text for text in texts.values() if text)
+    if len(counts) < 2:
+        return {}
+    order = [text for text, _ in sorted(counts.items(), key=lambda item: (-item[1], item[0]))]
+    return {name: 1 + order.index(text or order[0]) for name, text in texts.items()}
 
 
 def _video_source(

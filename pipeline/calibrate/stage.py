@@ -32,10 +32,10 @@ from ...schemas import (
     read_json,
     read_toml,
 )
-from ...schemas.calibration import CalibrationAttempt, CalibrationReport, ImageVerdict
+from ...schemas.calibration import CalibrationAttempt, CalibrationReport, FocalFigures, ImageVerdict
 from ..runtime.work_budget import Part, within_budget
 from . import colmap
-from .attempts import MIN_PHOTOS, Candidate, check_figures, limited, photo_count, photo_labels, search, verdict
+from .attempts import MIN_PHOTOS, Candidate, check_figures, estimated, photo_count, photo_labels, search, verdict
 from .center_uncertainty import center_stds
 from .markers import detect_markers, dictionary
 from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
@@ -267,7 +267,8 @@ def _report(
         world_frame=world_frame,
         ground_tilt_deg=tilt,
         ground_height_m=height,
-        warnings=(*inputs.notes, *_warnings(best), *_uncertain_centers(stds)),
+        focal_lengths=_focal_figures(best),
+        warnings=(*inputs.notes, *_warnings(best), *_wrong_exif(best), *_uncertain_centers(stds)),
         config=config,
         versions=colmap.versions(),
         wall_time_s=0.0,
@@ -276,9 +277,34 @@ def _report(
 
 def _center_stds_percent(best: Candidate, inputs: Inputs) -> dict[str, float]:
     """Return the standard deviation of each optical centre [% of their extent], at most 100."""
-    used = set(best.model.image_camera.values()) - set(inputs.known)
-    models = {camera: model for camera, model in limited(best.camera_model, inputs).items() if camera in used}
-    return {image: round(min(100.0 * std, 100.0), 4) for image, std in center_stds(best.model, models).items()}
+    models = estimated(best.camera_model, best.model, inputs)
+    with_exif = [camera for camera, focal in best.focals.items() if focal.agree]
+    return {
+        image: round(min(100.0 * std, 100.0), 4) for image, std in center_stds(best.model, models, with_exif).items()
+    }
+
+
+def _focal_figures(best: Candidate) -> dict[str, FocalFigures]:
+    return {
+        camera: FocalFigures(
+            px=round(best.model.cameras[camera].focal_px, 3),
+            exif_px=round(focal.exif_px, 3),
+            matches_px=round(focal.matches_px, 3),
+            matches_std_percent=round(min(100.0 * focal.matches_std, 100.0), 3),
+            exif_used=focal.agree,
+        )
+        for camera, focal in best.focals.items()
+    }
+
+
+def _wrong_exif(best: Candidate) -> list[str]:
+    return [
+        f"camera '{camera}': the EXIF data of the photos say a focal length of {focal.exif_px:.0f} px, their matches "
+        f"{focal.matches_px:.0f} +- {100.0 * focal.matches_std:.2g} %; the EXIF data were not used (cut-out photos "
+        "keep those of the whole ones)"
+        for camera, focal in best.focals.items()
+        if not focal.agree
+    ]
 
 
 def _uncertain_centers(stds_percent: dict[str, float]) -> list[str]:

@@ -29,6 +29,7 @@ from cgwm.schemas import (
     UsageError,
     read_json,
 )
+from helpers.exif import add_exif, tiff
 from helpers.sfm_scene import look_at, rotation_about
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -214,7 +215,14 @@ def test_without_scale_the_ground_is_the_dominant_plane(scene, report, tmp_path)
     with pytest.raises(UsageError, match="is no calibration of cgwm"):
         calibrate(root, CONFIG, overwrite=True)
     (root / "calibration.json").write_bytes((scene / "calibration.json").read_bytes())
+    for photo in (root / "images").iterdir():
+        add_exif(photo, tiff(equivalent=36))  # 36 mm of a diagonal of 43.27 mm: 416 px of one of 500 px; true are 420
     unscaled = calibrate(root, CONFIG, overwrite=True)
+    focal = unscaled.focal_lengths["photos"]
+    assert focal.exif_used
+    assert focal.exif_px == pytest.approx(36 * 500 / np.hypot(36, 24), rel=1e-3)
+    assert min(focal.exif_px, focal.matches_px) < focal.px < max(focal.exif_px, focal.matches_px)
+    assert "focal length of 'photos': " in str(unscaled)
     assert unscaled.scale == Scale(kind="unscaled", source="none given in capture.toml, [calibration]")
     assert unscaled.world_frame.startswith("the dominant plane of the sparse points is the ground")
     cameras = read_json(root / "cameras.json", CamerasFile)
