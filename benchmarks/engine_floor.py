@@ -186,8 +186,12 @@ def main() -> int:
     best = best_numbers([row for row in store.results() if row["stage"] == "dev"]) if given.stage == "report" else {}
     with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         waiting = {pool.submit(_timed, job, _tried(job, best)): job for job in wanted if store.known(job.key) is None}
-        for done in as_completed(waiting):
-            store.add(waiting[done].key, vars(waiting[done]) | done.result())
+        try:
+            for done in as_completed(waiting):
+                store.add(waiting[done].key, vars(waiting[done]) | done.result())
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # else what waits runs to its end before the error is seen
+            raise
     return 0
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
+from functools import cache
+from importlib import import_module
 
 from cgwm.datasets.synthetic.dynamics import ContactTruth
 from cgwm.datasets.synthetic.objects import SolidObject
@@ -42,8 +43,16 @@ ENGINES: dict[str, Entry] = {
 def refusal(name: str, solid: SolidObject) -> str | None:
     """Return why an engine cannot simulate a solid, or None where it can."""
     entry = ENGINES[name]
-    if find_spec(entry.module) is None:
-        return f"{entry.module} is not installed (pip install --no-deps -r benchmarks/requirements.txt)"
     if not entry.any_solid and not all(dart_engine.is_box(part) for part in solid.parts):
         return "its collision detector knows no convex parts but boxes"
+    return _missing(entry.module)
+
+
+@cache
+def _missing(module: str) -> str | None:
+    """Return why a module cannot be imported: it is not installed, or a library of the system that it needs is not."""
+    try:
+        import_module(module)
+    except ImportError as error:
+        return f"{module} cannot be imported: {error} (pip install --no-deps -r benchmarks/requirements.txt)"
     return None
