@@ -4,6 +4,7 @@
     python benchmarks/engine_floor.py run --stage dev --workers 2
     python benchmarks/engine_floor.py run --stage report --workers 2
     python benchmarks/engine_floor.py table
+    python benchmarks/engine_floor.py friction
 
 Nothing is fitted, filmed or rendered: what an open-loop prediction from the true state misses by is what the law cannot
 express, or what nobody can predict. Friction is the engine's own. Natural time and damping ratio have a counterpart in
@@ -30,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cgwm.datasets.synthetic.dynamics import GRAVITY, rest_pose
 from cgwm.schemas import NotConvergedError
 from store import Store, timed
 from tabletop.capture import TASKS, Task, plan_capture
@@ -43,6 +45,7 @@ OBJECTS = ("box", "l_block", "mustard_bottle", "mug")
 TIMES_S = (0.002, 0.003, 0.0045, 0.007, 0.011, 0.017)
 RATIOS = (0.15, 0.25, 0.4, 0.6, 0.9)
 GRID = tuple(f"{time:g} {ratio:g}" for time, ratio in itertools.product(TIMES_S, RATIOS))
+DIRECTIONS_DEG = (0.0, 22.5, 45.0, 67.5, 90.0)
 UNIT_MM, UNIT_DEG = 10.0, 10.0
 """Errors count in these units where one number must be found."""
 
@@ -162,10 +165,40 @@ def _both(errors: Any) -> str:
     return f"{middle[0]:.1f} / {middle[1]:.1f} ({mean[0]:.1f} / {mean[1]:.1f})"
 
 
+def friction_by_direction(engine: str) -> list[float]:
+    """Return the friction that a sliding box feels along `DIRECTIONS_DEG` of the world, from how far it slides.
+
+    Coulomb's law gives v^2 / (2 g distance) in every direction; an engine that cuts the cone into a pyramid does not.
+
+    Args:
+        engine: One of `ENGINES`.
+    """
+    item, speed = load_item("box"), 0.7
+    made = ENGINES[engine].make(item.solid, MATERIALS["wood"], False)
+    pose = rest_pose(item.solid, item.down, 0.3, 0, 0)
+    result = []
+    for angle in np.radians(DIRECTIONS_DEG):
+        motion = made.simulate(pose, np.array([speed * np.cos(angle), speed * np.sin(angle), 0, 0, 0, 0]), 0.0, 0.8)
+        distance = float(np.linalg.norm(motion.qpos[-1, :2] - motion.qpos[0, :2]))
+        result.append(speed**2 / (2 * GRAVITY * distance))
+    return result
+
+
+def friction_table() -> str:
+    """Return the friction of every engine by direction in Markdown."""
+    lines = ["| engine | " + " | ".join(f"{angle:g} deg" for angle in DIRECTIONS_DEG) + " |"]
+    lines += ["| --- |" + " --- |" * len(DIRECTIONS_DEG)]
+    for name in ENGINES:
+        reason = refusal(name, load_item("box").solid)
+        cells = [reason] if reason else [f"{value:.3f}" for value in friction_by_direction(name)]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join((*lines, f"Given: {MATERIALS['wood'].friction:g}."))
+
+
 def main() -> int:
     """Measure what is missing, or print the table of what is stored."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "table"))
+    parser.add_argument("what", choices=("run", "table", "friction"))
     parser.add_argument("--stage", choices=tuple(FIRST_SEED), default="dev")
     parser.add_argument("--engines", default=",".join(ENGINES))
     parser.add_argument("--captures", type=int, default=8, help="of every engine and task")
@@ -177,6 +210,9 @@ def main() -> int:
     unknown = [name for name in given.engines.split(",") if name not in ENGINES]
     if unknown:
         parser.error(f"--engines: {unknown[0]!r} is none of {', '.join(ENGINES)}")
+    if given.what == "friction":
+        print(friction_table())
+        return 0
     store = Store("engine_floor", given.store, given.any_commit)
     if given.what == "table":
         print(table(store.results()))

@@ -22,6 +22,7 @@ BOX = make_object(0)
 def engines() -> ModuleType:
     sys.path.insert(0, str(BENCHMARKS))
     try:
+        import engine_floor  # noqa: F401
         import tabletop.engines
         import tabletop.materials
         import tabletop.pushes
@@ -51,6 +52,16 @@ def test_a_sliding_box_stops_after_v2_over_2_mu_g(make, engines: ModuleType) -> 
     slid = np.linalg.norm(motion.qpos[-1, :2] - motion.qpos[0, :2])
     assert slid == pytest.approx(speed**2 / (2 * friction * GRAVITY), rel=0.03)
     assert abs(motion.qpos[-1, 2] - motion.qpos[0, 2]) < 2e-4
+
+
+def test_friction_is_a_cone_but_for_the_two_engines_that_say_otherwise(engines: ModuleType) -> None:
+    """A pyramid along the world's axes: inscribed in MuJoCo's default contacts, circumscribed in DART."""
+    import engine_floor
+
+    given = engines.materials.MATERIALS["wood"].friction
+    for name, factor in {"mujoco": 1, "mujoco_default": 0.5**0.5, "drake": 1, "dart": 2**0.5, "rapier": 1}.items():
+        if engines.engines.refusal(name, BOX) is None:
+            assert engine_floor.friction_by_direction(name)[2] == pytest.approx(factor * given, rel=0.03)
 
 
 def test_the_centre_of_mass_flies_along_its_parabola(make) -> None:
