@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -12,28 +12,72 @@ from .options import ConfigFile, Overwrite, Seed, Settings
 from .verb import verb
 
 if TYPE_CHECKING:
-    from ..schemas import CalibrationReport
+    from ..schemas import TargetSheet
 
 
 @verb
 def calibrate(
     emit: Emit,
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="The capture's directory.", show_default=False)],
+    capture: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CAPTURE",
+            help="The capture's directory. With --target: a folder of photos of the board, or the board to write.",
+            show_default=False,
+        ),
+    ],
+    target: Annotated[
+        Literal["charuco"] | None,
+        typer.Option(
+            "--target",
+            help="Write the board (CAPTURE is a .pdf or .svg), or measure intrinsics from photos "
+            "of it (CAPTURE is their folder).",
+            show_default=False,
+        ),
+    ] = None,
+    intrinsics: Annotated[
+        Path | None,
+        typer.Option(
+            "--intrinsics",
+            metavar="FILE",
+            help="Known intrinsics: intrinsics.json of a target, or cameras.json of an earlier calibration.",
+            show_default=False,
+        ),
+    ] = None,
     seed: Seed = None,
     overwrite: Overwrite = False,
     config: ConfigFile = None,
     set_: Settings = None,
 ) -> None:
     """Estimate cameras from photos: poses, lens, metric scale, and a verdict for each image."""
-    from ..pipeline.calibrate import calibrate as work
-    from ..schemas import CalibrateConfig
+    from ..schemas import CalibrateConfig, UsageError
     from .settings import StageSettings
 
     settings = StageSettings({"calibrate": CalibrateConfig}, config, set_).configure(
         "calibrate", CalibrateConfig, seed=seed
     )
-    emit(work(capture, settings, overwrite), _summary)
+    if target is None:
+        from ..pipeline.calibrate import calibrate as work
+
+        emit(work(capture, settings, overwrite, intrinsics), str)
+        return
+    if intrinsics is not None:
+        raise UsageError("--target measures intrinsics; --intrinsics gives them.", todo="leave one of the two out.")
+    from ..pipeline.calibrate import calibrate_target, print_target
+
+    if capture.suffix.lower() in (".pdf", ".svg") and not capture.is_dir():
+        emit(print_target(capture, overwrite), _printed)
+    else:
+        emit(calibrate_target(capture, overwrite), lambda file: f"{file}\n{_use(capture)}")
 
 
-def _summary(report: CalibrationReport) -> str:
-    return str(report)
+def _printed(sheet: TargetSheet) -> str:
+    return (
+        f"{sheet.path}: a board of {sheet.width_mm:g} x {sheet.height_mm:g} mm on A4. Print it, lay it flat on "
+        "something stiff, take 15 to 30 photos of it from all sides, tilted by 30 to 45 degrees and in all corners of "
+        "the picture, then: cgwm calibrate PHOTOS --target charuco"
+    )
+
+
+def _use(folder: Path) -> str:
+    return f"use them: cgwm calibrate CAPTURE --intrinsics {folder / 'intrinsics.json'}"

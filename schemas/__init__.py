@@ -137,6 +137,7 @@ from .improve import (
     ImproveTestStep,
     ImproveTrial,
 )
+from .intrinsics import IntrinsicsFile, TargetPhoto, TargetSheet
 from .model import (
     MODEL_FORMAT,
     BodyModel,
@@ -254,6 +255,7 @@ __all__ = [
     "IndexEntry",
     "InputDataError",
     "InterruptedWork",
+    "IntrinsicsFile",
     "JointModel",
     "KeptOutput",
     "KnownCameraDistance",
@@ -314,6 +316,8 @@ __all__ = [
     "SplatConfig",
     "Surface",
     "SynthesizeConfig",
+    "TargetPhoto",
+    "TargetSheet",
     "ThrowGrid",
     "ThrowsFile",
     "UsageError",

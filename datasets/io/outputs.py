@@ -36,12 +36,14 @@ DirectoryKind = Literal[
 ]  # fmt: skip
 FileKind = Literal[
     "page", "MJCF file", "USD file", "glTF file", "splat file", "index", "effect", "effect template", "calibration",
-    "truth", "track file", "manifest", "Rerun recording",
+    "truth", "track file", "manifest", "Rerun recording", "calibration target", "intrinsics",
 ]  # fmt: skip
 
 _DIRECTORY_KINDS = frozenset(get_args(DirectoryKind))
 
-_REPEATABLE = frozenset({"MJCF file", "USD file", "glTF file", "splat file", "effect template", "index"})
+_REPEATABLE = frozenset(
+    {"MJCF file", "USD file", "glTF file", "splat file", "effect template", "index", "calibration target"}
+)
 
 _SYSTEM_FILES = re.compile(
     r"(.*/)?(\.DS_Store|Thumbs\.db|desktop\.ini|__pycache__/.*|\..*\.(partial|pending|replaced)-.*)"
@@ -354,6 +356,8 @@ _RECOGNISED: Mapping[str, Callable[[Path], bool]] = {
     "USD file": _head(b"#usda 1.0", b"Written by cgwm"),
     "glTF file": _head(b"glTF", b'"generator":"cgwm"'),
     "Rerun recording": _head(b"RRF2", b"cgwm"),
+    "calibration target": _head(b"cgwm: ChArUco board"),
+    "intrinsics": _head(b'"cgwm-intrinsics/'),
     "splat file": _head(b"ply\n", b"comment unit metre\ncomment frame "),
     "index": _is_index,
     "effect": _is_unchanged,

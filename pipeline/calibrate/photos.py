@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.exif import photo_lens
 from ...datasets.capture.images import image_size, write_image
-from ...schemas import CameraIntrinsics, InputDataError
+from ...schemas import CameraIntrinsics
 from .colmap import SfmImage
+from .given_intrinsics import known_by_size
 
 STILL_BELOW_PX = 2.0
 """Threshold on the median displacement of the background per 1000 px of image width [px], for a static camera."""
@@ -61,12 +62,13 @@ def video_label(camera: str) -> str:
     return f"video:{camera}"
 
 
-def gather(capture: Capture, folder: Path) -> Inputs:
+def gather(capture: Capture, folder: Path, intrinsics: Path | None = None) -> Inputs:
     """Collect the images of a capture in a working folder, under names that COLMAP can read.
 
     Args:
         capture: The capture.
         folder: An empty folder, kept for the duration of the calibration.
+        intrinsics: File of known intrinsics besides those of the manifest.
     """
     root = folder / "images"
     sources, notes, richest = _photos(capture, root)
@@ -83,7 +85,7 @@ def gather(capture: Capture, folder: Path) -> Inputs:
             continue
         sources.append(_video_source(folder, root, camera, frames[0], masks[0]))
         richest[f"video-{camera}"] = "SIMPLE_PINHOLE"  # one frame does not determine a lens
-    known = _known(capture, sources)
+    known = _known(capture, sources, intrinsics)
     return Inputs(root, tuple(sources), tuple(notes), moving, richest, known)
 
 
@@ -112,27 +114,12 @@ def background_flow(frames: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray
     return worst
 
 
-def _known(capture: Capture, sources: Sequence[Source]) -> dict[str, CameraIntrinsics]:
+def _known(capture: Capture, sources: Sequence[Source], file: Path | None) -> dict[str, CameraIntrinsics]:
     """Return the given intrinsics by camera; refuse those of a size that no photo has."""
-    given = {(one.width, one.height): one for one in capture.manifest.calibration.intrinsics}
-    known, sizes = {}, set()
-    for source in sources:
-        if source.label.startswith(video_label("")):
-            continue
-        size = image_size(capture.root / "images" / source.label)
-        sizes.add(size)
-        if size in given:
-            known[source.image.camera] = given[size]
-    for width, height in given:
-        if (width, height) not in sizes:
-            listed = ", ".join(f"{one[0]}x{one[1]}" for one in sorted(sizes))
-            raise InputDataError(
-                f"{capture.root / 'capture.toml'}: [[calibration.intrinsics]] are of photos of {width}x{height}, and "
-                "no photo has that size.",
-                f"the size of photos that are there: {listed}.",
-                "give the intrinsics at the size of the photos (fx, fy, cx and cy grow with the size).",
-            )
-    return known
+    photos = [source for source in sources if not source.label.startswith(video_label(""))]
+    sizes = {source.image.camera: image_size(capture.root / "images" / source.label) for source in photos}
+    given = known_by_size(capture, set(sizes.values()), file)
+    return {camera: given[size] for camera, size in sizes.items() if size in given}
 
 
 def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str], dict[str, str]]:

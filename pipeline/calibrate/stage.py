@@ -17,6 +17,7 @@ from ...datasets.capture.sparse_points import POINTS_NAME, write_points
 from ...datasets.io.atomic import sha256, temporary_directory
 from ...datasets.io.file_set import new_files, settle_files
 from ...datasets.io.kinds import refuse_other_kind
+from ...datasets.io.outputs import reads
 from ...datasets.io.places import require_place
 from ...datasets.io.progress import progress
 from ...schemas import (
@@ -37,6 +38,7 @@ from ..runtime.work_budget import Part, within_budget
 from . import colmap
 from .attempts import MIN_PHOTOS, Candidate, check_figures, estimated, photo_count, photo_labels, search, verdict
 from .center_uncertainty import center_stds
+from .given_intrinsics import read_intrinsics
 from .markers import detect_markers, dictionary
 from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
 from .photos import Inputs, gather, video_label
@@ -55,7 +57,10 @@ _MANY_WITHOUT_STRONG = 0.5
 """Share of registered images without a pair of many verified matches above which a warning is given."""
 
 
-def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = False) -> CalibrationReport:
+@reads("intrinsics")
+def calibrate(
+    capture_root: Path, config: CalibrateConfig, overwrite: bool = False, intrinsics: Path | None = None
+) -> CalibrationReport:
     """Estimate the cameras of a capture and write `cameras.json`, `sparse_points.ply` and `calibration.json`.
 
     COLMAP's incremental mapping registers the photos and the first frame of each static video camera. A model that
@@ -67,6 +72,7 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
         capture_root: The capture's directory.
         config: Settings.
         overwrite: Replace existing cameras.
+        intrinsics: Known intrinsics: `intrinsics.json` of a target, or `cameras.json` of an earlier calibration.
 
     Returns:
         The verdict on every image, the self-check, the attempts and the scale.
@@ -80,13 +86,13 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
     start = time.monotonic()
     capture_root = Path(capture_root)
     settle_files(capture_root / CAMERAS_NAME)
-    made_of = _input_sha256(capture_root)
+    made_of = _input_sha256(capture_root, intrinsics)
     if not overwrite and (kept := _finished(capture_root, config, made_of)) is not None:
         return kept
     capture = _open(capture_root, overwrite)
     require_place(capture_root / CAMERAS_NAME)  # now, not after minutes
     with _room_for_colmap(capture, config), temporary_directory("calibrate", _TEMPORARY) as folder:
-        inputs = gather(capture, folder)
+        inputs = gather(capture, folder, intrinsics)
         best, attempts = search(folder, inputs, config)
     frame, similarity, world_frame, warnings = _world(capture, best.model)
     model = best.model.transformed(similarity)
@@ -104,10 +110,13 @@ def calibrate(capture_root: Path, config: CalibrateConfig, overwrite: bool = Fal
     return report
 
 
-def _input_sha256(root: Path) -> str:
-    """Return the hash of all that a calibration reads: the manifest, the photos and the videos."""
+def _input_sha256(root: Path, intrinsics: Path | None) -> str:
+    """Return the hash of all that a calibration reads: the manifest, the photos, the videos, and given intrinsics."""
     names = [name for name in ("capture.toml", "images", "videos") if (root / name).exists()]
-    return hashlib.sha256("\n".join(f"{name} {sha256(root / name)}" for name in names).encode()).hexdigest()
+    parts = [f"{name} {sha256(root / name)}" for name in names]
+    if intrinsics is not None:
+        parts += [f"intrinsics {read_intrinsics(intrinsics)}"]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def _finished(root: Path, config: CalibrateConfig, made_of: str) -> CalibrationReport | None:

@@ -10,7 +10,7 @@ from ...datasets.capture.check import find_faults
 from ...datasets.io.kinds import kind_of
 from ...datasets.models.agreement import require_contact
 from ...datasets.models.model import read_model
-from ...schemas import InputDataError, UsageError
+from ...schemas import InputDataError, IntrinsicsFile, UsageError, read_json
 from ...schemas.validation import ValidationReport
 
 
@@ -20,7 +20,7 @@ def validate(
     """Check a capture, a model, a dataset, the ladder of models of `cgwm improve`, or a run of `cgwm control`.
 
     Args:
-        thing: CAPTURE, MODEL, DATASET, RUN, or the directory of a ladder.
+        thing: CAPTURE, MODEL, DATASET, RUN, the directory of a ladder, or the file `intrinsics.json` of a target.
         sample: Number of rollouts of a dataset to check, drawn at random; None checks all.
         seed: Seed of that draw.
         accept_units: Do not refuse units and frames of a capture that its motion contradicts.
@@ -35,6 +35,8 @@ def validate(
         UsageError: If a sample is requested of a capture or model.
     """
     path = Path(thing)
+    if path.is_file():
+        return validate_intrinsics(path)
     kind = kind_of(path)
     if sample is not None and kind in ("capture", "model", "ladder", "run"):
         raise UsageError(f"--sample: {path} is a {kind}, which is checked whole.", "a dataset.", "omit --sample.")
@@ -71,6 +73,14 @@ def validate_capture(path: Path | str, accept_units: bool = False) -> Validation
         listed = "\n".join(f"{number}. {text}" for number, text in enumerate(texts, 1))
         raise InputDataError(f"{path}: {len(faults)} faults.\n{listed}", todo="correct them, and validate it again.")
     return ValidationReport(path=str(path), kind="capture", facts=dataclasses.asdict(facts))
+
+
+def validate_intrinsics(path: Path) -> ValidationReport:
+    """Check a file of intrinsics that a calibration target gave."""
+    file = read_json(path, IntrinsicsFile)
+    facts = file.model_dump(exclude={"format", "photos", "camera", "versions"}) | file.camera.model_dump()
+    used = sum(not photo.reason for photo in file.photos.values())
+    return ValidationReport(path=str(path), kind="intrinsics", facts={"photos_used": used} | facts)
 
 
 def validate_model(path: Path | str) -> ValidationReport:

@@ -217,7 +217,7 @@ def settings_seen(stage: Callable[..., None]) -> list[Any]:
     """Collect the configuration that `cgwm calibrate` hands to its stage."""
     seen: list[Any] = []
 
-    def body(capture: Path, config: CalibrateConfig, overwrite: bool) -> None:
+    def body(capture: Path, config: CalibrateConfig, overwrite: bool, intrinsics: Path | None) -> None:
         seen.append(config)
         raise CheckFailedError("stop here")
 

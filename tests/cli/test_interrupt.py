@@ -1,6 +1,7 @@
 """A command that is interrupted, or killed outright, leaves nothing under its final name and can be run again."""
 
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from cgwm.datasets.models.model import Model, write_model
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.schemas import BodyModel, ContactParameters, Ground, ModelFile, Provenance
 from helpers.forked import Forked, forked
+from helpers.target_photos import write_photos
 
 Case = tuple[list[str], Path]
 
@@ -68,6 +70,14 @@ def calibrate_case(folder: Path) -> Case:
     return ["calibrate", str(capture)], capture / "cameras.json"
 
 
+def target_case(folder: Path) -> Case:
+    photos = folder / "photos"
+    write_photos(photos, 8)
+    for k in range(300):
+        shutil.copyfile(photos / f"{k % 8:02d}.png", photos / f"again-{k:03d}.png")
+    return ["calibrate", str(photos), "--target", "charuco"], photos / "intrinsics.json"
+
+
 def fit_case(folder: Path) -> Case:
     capture, out = folder / "capture", folder / "model"
     source = tosses(folder / "source", 60)
@@ -97,6 +107,7 @@ WRITE_EARLY = ("demo", "synthesize", "import")
 CASES: dict[str, Callable[[Path], Case]] = {
     "demo": demo_case,
     "calibrate": calibrate_case,
+    "target": target_case,
     "fit": fit_case,
     "synthesize": synthesize_case,
     "import": import_case,
@@ -107,7 +118,7 @@ SIGNALS = [
     pytest.param(verb, number, id=f"{verb}-{number.name}", marks=[pytest.mark.evidence] if late else [])
     for verb in CASES
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-    for late in [number != signal.SIGINT and verb != "import"]
+    for late in [verb == "target" or (number != signal.SIGINT and verb != "import")]
 ]
 """One handler serves all commands: the suite sends SIGINT to all of them, and all signals to one."""
 

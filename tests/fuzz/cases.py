@@ -91,7 +91,7 @@ OPTIONS = {
     "export": ("--split", "--cameras", "--every", "--task", "--rollout", "--mask", "--sh-degree", "--duration"),
     "import": ("--train", "--test", "--seed", "--only", "--columns", "--length-unit", "--time-unit", "--body"),
     "view": ("--port", "--host"),
-    "calibrate": ("--seed",),
+    "calibrate": ("--seed", "--target", "--intrinsics"),
 }  # fmt: skip
 
 

@@ -202,6 +202,19 @@ def calibration(root: Path) -> None:
     (root / "capture" / "capture.toml").write_text(scene.MANIFEST + scene.MARKERS)
 
 
+def board_photos(root: Path) -> None:
+    """Write photos of the calibration target, their intrinsics, and a capture of three of the photos."""
+    from cgwm.pipeline.calibrate import calibrate_target
+    from helpers.target_photos import write_photos
+
+    write_photos(root / "board", 10)
+    calibrate_target(root / "board")
+    (root / "capture" / "images").mkdir(parents=True)
+    for photo in sorted((root / "board").glob("*.png"))[:3]:
+        shutil.copyfile(photo, root / "capture" / "images" / photo.name)
+    (root / "capture" / "capture.toml").write_text('format = "cgwm-capture/1"\n')
+
+
 def things(root: Path) -> None:
     """Write one of everything, and what is the user's own."""
     csv(root)

@@ -22,6 +22,7 @@ from .captures import (
 from .models import bare, custom, dataset, hand, merged, model, plan, run, task
 from .recordings import (
     balldrops,
+    board_photos,
     bodies_csv,
     calibration,
     colmap,
@@ -162,6 +163,22 @@ SUBJECTS = {
                 ),
             ),
             weight=0.15,
+        ),
+        Subject(
+            "calibration target",
+            "captures",
+            board_photos,
+            (
+                command("calibrate board --target charuco --overwrite", changes=("board/intrinsics.json",)),
+                command("validate board/intrinsics.json"),
+                command(
+                    "calibrate capture --intrinsics board/intrinsics.json --set calibrate.retries=0",
+                    weight=0.3,
+                    changes=("capture/cameras.json", "capture/calibration.json", "capture/sparse*"),
+                ),
+            ),
+            ("board/*",),
+            weight=0.3,
         ),
         Subject("model", "models", model, (*ON_MODELS,), ("model/**/*",), 3),
         Subject(
