@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 from cgwm.datasets.capture.tracks import Track
@@ -209,16 +208,12 @@ CASES: dict[str, Callable[[Path], Command]] = {
 }
 
 
-def _descend_briefly(*given: Any, descend: Callable[..., Any] = pose_search.descend) -> Any:
-    return descend(*given[:4], 1, *given[5:])
-
-
 def without_waiting() -> None:
     """Write a checkpoint after every step, and leave out what takes long and writes nothing."""
     Checkpoint.__init__.__defaults__ = (0.0,)
     contact_shooting.SHOT_ITERATIONS = 1
-    pose_search.ROTATIONS, pose_search.KEPT, pose_search.descend = 6, 1, _descend_briefly
-    pose_tracking.KEYFRAMES, pose_tracking.BEAM, pose_tracking.descend = 1, 1, _descend_briefly
+    pose_search.ROTATIONS, pose_search.KEPT, pose_search.DESCENT_ITERATIONS = 6, 1, 1
+    pose_tracking.KEYFRAMES, pose_tracking.BEAM, pose_tracking.CARRY_ITERATIONS = 1, 1, 1
     bodies.refine = lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0))
 
 

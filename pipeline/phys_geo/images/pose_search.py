@@ -1,21 +1,17 @@
-"""Search for the pose of bodies at one instant of a video, from silhouettes, over all orientations, and by descent.
-
-The descent has a loop of its own: it rounds to single precision, and which of two equally good histories of a symmetric
-body is kept depends on that rounding.
-"""
+"""Search for the pose of bodies at one instant of a video, from silhouettes, over all orientations."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
+from ...geometry.rotation import quat_exp, quat_multiply, quat_to_matrix
 from .image_loss import ImageLoss
+from .pose_descent import Poses, descended
 from .video_frames import Video
 
 ROTATIONS = 72
@@ -24,6 +20,8 @@ NEARBY_DEG = (20.0, 40.0)
 """Angles from an expected orientation that a search also scores, each around fourteen axes [deg]."""
 KEPT = 6
 """Number of the best orientations of a search that are refined."""
+DESCENT_ITERATIONS = 6
+"""Maximum number of steps from each of them."""
 SAME_POSE = (0.15, math.radians(8.0))
 """Maximum distance and angle of equal poses (radii of the body, radians)."""
 MIN_SILHOUETTE_PX = 6.0
@@ -31,38 +29,6 @@ MIN_SILHOUETTE_PX = 6.0
 DIFFERENCE_FLOOR = 0.08
 """Minimum difference from the background of a pixel that shows a body, without masks; it must also exceed 4 times the
 median difference."""
-STEP_LIMIT = 0.5
-"""Maximum step of the descent, in radii of the body and radians."""
-SMALL_STEP = 1e-3
-"""Step below which the descent ends, in radii of the body and radians."""
-
-
-@dataclass(frozen=True)
-class Poses:
-    """Poses (K) of all bodies (nb) at one instant, with their image loss."""
-
-    position_m: Tensor
-    """Body frame origins [m], world, shape (K, nb, 3)."""
-    quat_wxyz: Tensor
-    """Orientations, shape (K, nb, 4)."""
-    value: Tensor
-    """Image loss, shape (K,)."""
-
-    def __len__(self) -> int:
-        return len(self.value)
-
-    def at(self, rows: Tensor) -> Poses:
-        """Return the poses of some rows."""
-        return Poses(self.position_m[rows], self.quat_wxyz[rows], self.value[rows])
-
-    @staticmethod
-    def joined(parts: list[Poses]) -> Poses:
-        """Return all poses of several groups."""
-        return Poses(
-            torch.cat([part.position_m for part in parts]),
-            torch.cat([part.quat_wxyz for part in parts]),
-            torch.cat([part.value for part in parts]),
-        )
 
 
 def search(loss: ImageLoss, instant: int, position_m: Tensor, quat_wxyz: Tensor, blur: int) -> Poses:
@@ -91,41 +57,12 @@ def search(loss: ImageLoss, instant: int, position_m: Tensor, quat_wxyz: Tensor,
         positions[:, index] = middle - quat_to_matrix(turns) @ center
         values = loss.values(torch.full((len(turns),), instant), positions, quats)
         order = values.argsort(stable=True)[:KEPT]
-        found = distinct(loss, descend(loss, instant, positions[order], quats[order], 6, blur), KEPT)
+        at = torch.full((len(order),), instant)
+        poses = descended(loss, at, positions[order], quats[order], DESCENT_ITERATIONS, blur)
+        found = distinct(loss, poses, KEPT)
         position, quat = found.position_m[0].clone(), found.quat_wxyz[0].clone()
     assert found is not None  # a model without a free body has no pose to find
     return found
-
-
-def descend(loss: ImageLoss, instant: int, position: Tensor, quat: Tensor, iterations: int, blur: int) -> Poses:
-    """Minimise the image loss of one instant from several poses (K, nb, ...) by Levenberg-Marquardt."""
-    return descend_all(loss, torch.full((len(position),), instant), position, quat, iterations, blur)
-
-
-def descend_all(loss: ImageLoss, instants: Tensor, position: Tensor, quat: Tensor, iterations: int, blur: int) -> Poses:
-    """Minimise the image loss from poses (K, nb, ...), each at its instant (K,), by Levenberg-Marquardt."""
-    model = loss.expand(instants, position, quat, blur)
-    damping = torch.full_like(model.value, 1e-2)
-    for _ in range(iterations):
-        diagonal = model.curvature.diagonal(dim1=1, dim2=2)
-        system = model.curvature + torch.diag_embed(damping[:, None] * diagonal + 1e-9)
-        step = -torch.linalg.solve(system.double(), model.slope.double()).to(position)
-        scale = torch.cat([step.new_tensor([loss.radii[index]] * 3 + [1.0] * 3) for index in loss.free])
-        step = step * (STEP_LIMIT / (step.abs() / scale).amax(1)).clamp_max(1.0)[:, None]
-        moved = loss.moved(position, quat, step)
-        trial = loss.expand(instants, *moved, blur)
-        better = trial.value < model.value
-        position = torch.where(better[:, None, None], moved[0], position)
-        quat = torch.where(better[:, None, None], quat_normalize(moved[1]), quat)
-        model = type(model)(
-            torch.where(better, trial.value, model.value),
-            torch.where(better[:, None], trial.slope, model.slope),
-            torch.where(better[:, None, None], trial.curvature, model.curvature),
-        )
-        damping = torch.where(better, damping / 5, damping * 10)
-        if bool(((step.abs() / scale).amax(1) < SMALL_STEP).all()):
-            break
-    return Poses(position, quat, model.value)
 
 
 def distinct(loss: ImageLoss, poses: Poses, most: int) -> Poses:

@@ -26,7 +26,8 @@ from ....schemas import NotConvergedError
 from ...geometry.rotation import geodesic_angle, quat_conjugate, quat_exp, quat_log, quat_multiply
 from ...trajectories.track_noise import Noise
 from .image_loss import ImageLoss, PoseQuality
-from .pose_search import Poses, descend, descend_all, distinct, located, search
+from .pose_descent import Poses, descended
+from .pose_search import distinct, located, search
 
 KEYFRAMES = 5
 """Number of instants at which all orientations are tried first."""
@@ -153,7 +154,7 @@ class PoseTracker:
         instants = torch.arange(count)
         chosen = torch.tensor(visible, dtype=torch.int64)
         if len(chosen):
-            poses = descend_all(
+            poses = descended(
                 self._fine, chosen, self._position[chosen], self._quat[chosen], POLISH_ITERATIONS, FINE_BLUR
             )
             self._position[chosen], self._quat[chosen] = poses.position_m, poses.quat_wxyz
@@ -196,7 +197,8 @@ class PoseTracker:
             corrected: Poses | None = None
             if last is not None:
                 position, quat = self._expected(last, instant)
-                corrected = descend(self._coarse, instant, position, quat, CARRY_ITERATIONS, COARSE_BLUR)
+                at = torch.full((len(position),), instant)
+                corrected = descended(self._coarse, at, position, quat, CARRY_ITERATIONS, COARSE_BLUR)
                 every = corrected if here is None else Poses.joined([corrected, here])
                 best = every.at(every.value.argsort(stable=True)[:1])
                 if self._alarmed(instant, best):
