@@ -340,7 +340,7 @@ class _TiedProblem(Problem):
         self.box = Box.within(prior.bounds, prior.mean, 1 / prior.std.square())
 
     def costs(self, point: Point, rows: Rows) -> Tensor:
-        """Return the robust cost of each chain (C,)."""
+        """Return the robust cost of each row of chains (C,)."""
         del rows
         found = self.shooting._residuals(point.values[0], self.by_segment(point.states))
         return self.chains.summed(_losses(*found)[0])

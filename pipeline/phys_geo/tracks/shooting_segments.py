@@ -76,38 +76,42 @@ class TiedSegments:
 
 @dataclass(frozen=True, kw_only=True)
 class Chains:
-    """Segments (B) in chains (C) of up to M tied segments.
+    """Segments (B) in rows (C) of up to M segments: chains of tied ones, several in a row where they fit.
 
-    A tie couples the states of two neighbouring segments only, so that the states of a chain are one item of the
-    least-squares solver, which eliminates them: systems of one chain instead of one of all segments.
+    A tie couples the states of two neighbouring segments only, so that the states of a row are one item of the
+    least-squares solver, which eliminates them: systems of one row instead of one of all segments.
     """
 
     segment: Tensor
-    """Segment at each place of each chain, 0 where there is none, shape (C, M)."""
+    """Segment at each place of each row, 0 where there is none, shape (C, M)."""
     filled: Tensor
     """Whether there is a segment, shape (C, M)."""
     chain: Tensor
-    """Chain of each segment, shape (B,)."""
+    """Row of each segment, shape (B,)."""
     place: Tensor
-    """Its place in the chain, shape (B,)."""
+    """Its place in the row, shape (B,)."""
 
     @staticmethod
     def of(following: Tensor) -> Chains:
         """Return the chains of segments whose following segment (B,), -1 for none, is the next one."""
-        chain, place = [], []
-        joined = False
-        for after in following.tolist():
-            chain.append(chain[-1] if joined else len(set(chain)))
-            place.append(place[-1] + 1 if joined else 0)
-            joined = after >= 0
-        rows, columns = torch.tensor(chain), torch.tensor(place)
-        segment = torch.zeros(chain[-1] + 1, max(place) + 1, dtype=torch.long)
+        ends = [0, *(k + 1 for k, after in enumerate(following.tolist()) if after < 0)]
+        chains = sorted((range(a, b) for a, b in itertools.pairwise(ends)), key=len, reverse=True)
+        longest, rows = len(chains[0]), list[list[int]]()
+        for chain in chains:
+            row = next((row for row in rows if len(row) + len(chain) <= longest), None)
+            if row is None:
+                rows.append(row := [])
+            row.extend(chain)
+        segment = torch.zeros(len(rows), longest, dtype=torch.long)
         filled = torch.zeros_like(segment, dtype=torch.bool)
-        segment[rows, columns], filled[rows, columns] = torch.arange(len(chain)), True
-        return Chains(segment=segment, filled=filled, chain=rows, place=columns)
+        places = torch.zeros(2, len(following), dtype=torch.long)
+        for number, row in enumerate(rows):
+            segment[number, : len(row)], filled[number, : len(row)] = torch.tensor(row), True
+            places[0, row], places[1, row] = number, torch.arange(len(row))
+        return Chains(segment=segment, filled=filled, chain=places[0], place=places[1])
 
     def by_chain(self, values: Tensor) -> Tensor:
-        """Return values (B, ...) of segments by chain and place, shape (C, M, ...)."""
+        """Return values (B, ...) of segments by row and place, shape (C, M, ...)."""
         return values[self.segment]
 
     def by_segment(self, values: Tensor) -> Tensor:
@@ -121,7 +125,7 @@ class Chains:
     def normal_equations(
         self, own: tuple[Tensor, Tensor], tie: tuple[Tensor, Tensor], prior: Tensor, cost: Tensor
     ) -> NormalEquations:
-        """Return the normal equations of the chains, whose states are those of their segments (M S).
+        """Return the normal equations of the rows, whose states are those of their segments (M S).
 
         Args:
             own: Information (B, P + S, P + S) and gradient (B, P + S) of the frames of each segment by parameters and
