@@ -91,7 +91,7 @@ class _PoseProblem(Problem):
         self.loss, self.instants, self.blur = loss, instants, blur
         self.owner = torch.arange(len(instants), device=like.device)
         # renders have single precision; the small systems of their derivatives are solved in double precision
-        self.box = Box.unbounded(like.new_zeros(len(instants), 0, dtype=torch.float64))
+        self.box = Box.unbounded(like.new_zeros((len(instants), 0), dtype=torch.float64))
         self.units = torch.tensor(
             [unit for index in loss.free for unit in [loss.radii[index]] * 3 + [1.0] * 3], device=like.device
         ).double()
@@ -101,7 +101,7 @@ class _PoseProblem(Problem):
         position, quat = point.states
         model = self.loss.expand(self.instants[rows.items.cpu()], position, quat, self.blur)
         count, size = model.slope.shape
-        none = model.slope.new_zeros(count, 0, dtype=torch.float64)
+        none = model.slope.new_zeros((count, 0), dtype=torch.float64)
         return NormalEquations(
             states=model.curvature.double(),
             mixed=none.new_zeros(count, size, 0),
