@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ....schemas import Surface
 from ...capture.cameras import Camera
+from ..coulomb_step import ask_for_no_slip, coulomb_step
 from ..dynamics import BODY_GROUP, GROUND_GROUP, MjModel, mujoco
 from ..raycast import Lamp, Plain, Raycaster
 from ..rig import look_at
@@ -18,8 +19,6 @@ STEPS_PER_S = 3600
 """Steps of the simulation in a second: a multiple of the rate of the tracks."""
 IMPEDANCE = 0.97
 """MuJoCo's constraint impedance at every depth [1]."""
-EXCESS, RATES_1_S = 1.2, (20.0, 2000.0)
-"""What sliding friction asks for in units of what there is, and the bounds of the rate at which it stops slip."""
 _GROUND_HALF_M = 1.2
 """Half the side of the part of the ground that pictures show; what is simulated has no edge."""
 _SURFACE_COLORS = ((0.80, 0.76, 0.68), (0.62, 0.56, 0.48))
@@ -59,39 +58,15 @@ def build_model(plan: WorldPlan) -> MjModel:
 
 def simulate(plan: WorldPlan, model: MjModel, episode: WorldEpisode, rate_hz: int) -> Array:
     """Return the poses of all bodies, position [m] and quat_wxyz, shape (frames, bodies, 7), at a rate."""
-    data, friction = mujoco.MjData(model), _Friction(plan, model)
+    ask_for_no_slip(model)
+    data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = episode.qpos.ravel(), episode.qvel.ravel()
     frames = [data.qpos.copy()]
     for step in range(round(episode.length_s * STEPS_PER_S)):
-        friction.update(data.qvel.reshape(-1, 6))
-        mujoco.mj_step(model, data)
+        coulomb_step(model, data)
         if (step + 1) % (STEPS_PER_S // rate_hz) == 0:
             frames.append(data.qpos.copy())
     return np.asarray(frames).reshape(-1, len(plan.things), 7)
-
-
-class _Friction:
-    """Time constants of slip of all pairs, set before each step by the speed of their body, of two by the later one's.
-
-    A fast constant that friction cannot meet would lift a sliding body, see `synthetic/friction.py`; a slow one would
-    let it creep at rest. A ball rolls, so that its friction holds.
-    """
-
-    def __init__(self, plan: WorldPlan, model: MjModel) -> None:
-        self._model = model
-        # of a body and a surface, MuJoCo may list the surface first
-        bodies = np.maximum(model.geom_bodyid[model.pair_geom1], model.geom_bodyid[model.pair_geom2])
-        self._body = bodies - model.body(plan.things[0].name).id
-        self._rolls = np.array([plan.things[k].radius_m is not None for k in self._body])
-        self._limit = EXCESS * GRAVITY_M_S2 * model.pair_friction[:, 0]
-
-    def update(self, qvel: Array) -> None:
-        """Set the constants by the velocities (bodies, 6)."""
-        speed = np.linalg.norm(qvel[self._body, :3], axis=1)
-        rate = (self._limit / speed.clip(1e-4)).clip(*RATES_1_S)
-        rate = np.where(self._rolls, RATES_1_S[1], rate)
-        self._model.pair_solreffriction[:, 0] = 2 / (IMPEDANCE * rate)
-        self._model.pair_solreffriction[:, 1] = 1.0
 
 
 def picture(plan: WorldPlan, poses: Array, size: tuple[int, int] = (480, 360)) -> NDArray[np.uint8]:
