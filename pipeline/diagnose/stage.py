@@ -15,7 +15,6 @@ from ...datasets.capture.capture import Capture
 from ...datasets.io.atomic import new_file
 from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note
-from ...datasets.models.joints import INSTEAD, refuse_joints
 from ...datasets.models.model import Model, read_model
 from ...schemas import (
     ContactLimit,
@@ -39,13 +38,14 @@ from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
 from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.candidates import Candidate, admissible
+from ..segments.center_of_mass import as_one_body
 from ..segments.described_motion import not_described
 from ..segments.group_parameters import with_known_groups
 from ..segments.input_checks import check_observability, check_units_and_geometry
 from ..segments.prepare import Prepared, prepare
 from ..segments.residual_wrench import Omnibus, covariates_of, wrench_windows
 from .detection_limits import DetectionLimit
-from .episodes import diagnosed_episodes
+from .episodes import DiagnosedEpisodes, diagnosed_episodes
 from .evidence import Evidence
 from .experiments import DEFAULT, Experiment, experiments_of, read_experiments
 from .law_export import require_law_file, save_law
@@ -56,9 +56,16 @@ from .page import diagnosis_html, mark_of
 from .pictures import pictures_of
 from .remaining import held_out_of, remaining_of
 from .sparse_regression import residual_law
+from .thresholds import THRESHOLDS
 from .verdict import Findings, find
 from .wording import law_warnings, motion_warnings, sentence, unseen_motion
 
+JOINTED = (
+    "of the jointed body '{name}' the motion of the centre of mass of its links was examined, in flight alone: what "
+    "acts on it as a whole is found, not what turns it, and nothing in contact. Losses of its joints are numbers of "
+    "'cgwm fit'; masses of links that are wrong by more than a tenth can look like a force."
+)
+"""Warning that limits a verdict about a jointed body."""
 _LESS = "name a split with fewer episodes, or use a model with a longer step_s."
 
 
@@ -105,15 +112,15 @@ def diagnose(
     compared = experiments_of(DEFAULT) if throws is None else read_experiments(throws)
     library = library_of(candidates)
     loaded = read_model(model)
-    refuse_joints(loaded.file.articulations, str(model), "diagnose", INSTEAD.format(model=model, capture=capture))
     accepted = accept_units or loaded.accepts_units
     opened = Capture.open(capture, splits=(split,), accept_units=accepted)
     note(f"diagnose: flights, contacts and noise of {len(opened.episodes(split))} episodes")
     world, prepared = prepared_world(loaded, opened, split, device, accepted)
     note(f"diagnose: {len(library)} effects")
     result, findings = report_and_findings(prepared, world, library, compared)
-    episodes = diagnosed_episodes(loaded, opened, split).episodes
-    result = _first_of_all(result, not_described(world, episodes, prepared.noise))
+    if not loaded.file.articulations:
+        episodes = diagnosed_episodes(loaded, opened, split).episodes
+        result = _first_of_all(result, not_described(world, episodes, prepared.noise))
     if save_law_to is not None:
         present = [split_units(effect.name)[0] for effect in loaded.file.effects]
         result = result.model_copy(update={"saved_law": save_law(result, save_law_to, overwrite, present)})
@@ -147,6 +154,8 @@ def prepared_world(
     """
     world = replace(_world(model, capture), rolls_on=resolve_device(device).type)
     found = diagnosed_episodes(model, capture, split)
+    if world.chains:
+        world, found = _whole(world, found, f"{capture.root}: split '{split}'")
     names = [name for name, _ in found.episodes]
     world = with_known_groups(world, model.file, names, capture.groups)
     if not accept_units:
@@ -290,6 +299,22 @@ def _world(model: Model, capture: Capture) -> World:
     if ground is None or world.ground_offset is None:
         return world
     return replace(world, ground_offset=torch.full_like(world.ground_offset, ground.offset_m))
+
+
+def _whole(world: World, found: DiagnosedEpisodes, place: str) -> tuple[World, DiagnosedEpisodes]:
+    """Return the flights of the centre of mass of a jointed body as episodes of a body that touches nothing.
+
+    Its noise is measured: that of the links does not say what the errors of their orientations add.
+    """
+    name, least = world.chains[0].name, THRESHOLDS.verdict.min_episodes
+    alone, flown = as_one_body(world, found.episodes, found.noise, place)
+    if len(flown) < least:
+        raise InputDataError(
+            f"{place}: '{name}' flies without touching anything in {len(flown)} episodes.",
+            f"flights in at least {least} episodes; in contact, jointed bodies are not examined.",
+            "record throws, or use 'cgwm compare', which shows in which phase and at which link predictions miss.",
+        )
+    return alone, DiagnosedEpisodes(flown, (None, None), (*found.warnings, JOINTED.format(name=name)))
 
 
 def _groups(capture: Capture, names: Sequence[str]) -> list[int]:

@@ -94,7 +94,6 @@ def fit_motion(
 def _require_fittable(model: Model, capture: Capture, config: PhysConfig) -> None:
     """Refuse a model or a capture from whose motion no physics can be fitted."""
     asked = [name for name in ("mass_distribution", "length_scale") if getattr(config, name) is True]
-    asked += ["effects"] if config.effects else []
     if asked:
         refuse_joints(model.file.articulations, str(capture.root), f"fit with phys-geo.{asked[0]}")
     uses_photos = any(name in model.body_splats for name in capture.body_names)

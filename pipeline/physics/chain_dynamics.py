@@ -7,15 +7,16 @@ and gravity forces, and servos that are implicit in the step (derived; Featherst
 
     A v' = (M + I) v + h (k (q_cmd - q) - b(q, (v + v*) / 2)),   A = M + diag(I + h d + h^2 k)
 
-v* is the same with b(q, v): the scheme is of second order, and without servos it keeps the energy to that order. A
-servo at its torque limit pushes with that limit and has no h^2 k. Contacts and the joints' rows, which are those of
-v times A^(-1/2), then change v' to v+, and q goes on by h (v + v+) / 2, as in `rigid_body.advance`. Links without mass
+Forces of effects on the links are part of b. v* is the same with b(q, v): the scheme is of second order, and without
+servos it keeps the energy to that order. A servo at its torque limit pushes with that limit and has no h^2 k. Contacts
+and the joints' rows, which are those of v times A^(-1/2), then change v' to v+, and q goes on by h (v + v+) / 2, as in
+`rigid_body.advance`. Links without mass
 make A diagonal: a geared hand.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -56,6 +57,25 @@ class Kick:
     """Inverse of the Cholesky factor L of A = L L^T, shape (B, nv, nv)."""
     rows: Tensor
     """Velocity of each link's origin and its angular velocity by generalised velocity, shape (B, L, 6, nv)."""
+
+
+@dataclass(frozen=True)
+class CentralMotion:
+    """Motion of a body about its centre of mass, world frame, by which effects push it."""
+
+    com: Tensor
+    """Centre of mass [m], shape (B, 3)."""
+    rotation: Tensor
+    """Rotation, body to world, shape (B, 3, 3)."""
+    velocity: Tensor
+    """Velocity of the centre of mass [m/s], shape (B, 3)."""
+    omega: Tensor
+    """Angular velocity [rad/s], shape (B, 3)."""
+
+
+LinkWrench = Callable[[int, CentralMotion], tuple[Tensor, Tensor]]
+"""Force [N] through the centre of mass and torque [N m] about it, each (B, 3), on a link given by its index in the
+world."""
 
 
 class ChainDynamics:
@@ -124,6 +144,7 @@ class ChainDynamics:
         gravity: Tensor,
         target: Tensor | None,
         ahead: Motion | None,
+        wrench: LinkWrench | None = None,
     ) -> Kick:
         """Return the generalised velocity after the forces of a step, without contact.
 
@@ -133,6 +154,7 @@ class ChainDynamics:
             gravity: Gravitational acceleration [m/s2], shape (1 or B, 3).
             target: Targets of the servos at the end of the step [rad or m], shape (B, joints); None for none.
             ahead: Motion of a driven root at the end of the step; None for another base.
+            wrench: What effects do to the links; None for nothing.
         """
         h = step_s[:, None]
         half = self.drift(motion, 0.5 * step_s)
@@ -164,7 +186,10 @@ class ChainDynamics:
         acceleration = _base_acceleration(motion, ahead, h)
 
         def after(mean: Tensor) -> Tensor:
-            bias = place.bias(self.with_speed(half, mean), gravity, acceleration)
+            at = self.with_speed(half, mean)
+            bias = place.bias(at, gravity, acceleration)
+            if wrench is not None:
+                bias = bias - place.pushed(at, wrench)
             right = inverse_root @ (kept - h * bias)[..., None]
             return (inverse_root.transpose(-1, -2) @ right).squeeze(-1)
 
@@ -216,6 +241,8 @@ class _Place:
     dynamics: ChainDynamics
     origin: Tensor
     """Origins of the links, shape (B, L, 3)."""
+    rotation: Tensor
+    """Rotations of the links, shape (B, L, 3, 3)."""
     com: Tensor
     """Centres of mass of the links, shape (B, L, 3)."""
     inertia: Tensor
@@ -235,7 +262,7 @@ class _Place:
         turning = torch.cat((axes, cross(at, axes)), -1)
         sliding = torch.cat((torch.zeros_like(axes), axes), -1)
         joints = torch.where(dynamics.hinge[:, None], turning, sliding)
-        return _Place(dynamics, origin, com, inertia, joints)
+        return _Place(dynamics, origin, rotation, com, inertia, joints)
 
     def columns(self) -> Tensor:
         """Return the motion of each link by generalised velocity, about the root's origin, shape (B, L, 6, nv)."""
@@ -267,6 +294,25 @@ class _Place:
         momentum = torch.cat(self.momentum(*columns.split(3, -2)), -2)
         return (columns.transpose(-1, -2) @ momentum).sum(1)
 
+    def velocities(self, motion: ChainMotion) -> Tensor:
+        """Return the motions (B, L, 6) of the links about the root's origin at this configuration."""
+        own = self.joints * motion.speeds[..., None]
+        root = torch.cat((motion.omega, motion.velocity), -1)[:, None]
+        return root + (self.dynamics.above[None, :, :, None] * own[:, None]).sum(2)
+
+    def pushed(self, motion: ChainMotion, wrench: LinkWrench) -> Tensor:
+        """Return the generalised forces (B, nv) of effects on the links at this configuration."""
+        turning, moving = self.velocities(motion).split(3, -1)
+        moved = moving + cross(turning, self.com)
+        both = []
+        for place, index in enumerate(self.dynamics.indices):
+            com = motion.position + self.com[:, place]
+            link = CentralMotion(com, self.rotation[:, place], moved[:, place], turning[:, place])
+            force, torque = wrench(index, link)
+            both.append(torch.cat((torque + cross(self.com[:, place], force), force), -1))
+        columns = self.columns().transpose(-1, -2)
+        return (columns @ torch.stack(both, 1)[..., None]).sum((1, 3))
+
     def bias(self, motion: ChainMotion, gravity: Tensor, driven: tuple[Tensor, Tensor] | None) -> Tensor:
         """Return the forces b (B, nv) that keep the generalised velocity: Coriolis, centrifugal, and against gravity.
 
@@ -277,9 +323,7 @@ class _Place:
         """
         above, joints = self.dynamics.above, self.joints
         own = joints * motion.speeds[..., None]
-        velocity = torch.cat((motion.omega, motion.velocity), -1)[:, None] + (
-            above[None, :, :, None] * own[:, None]
-        ).sum(2)
+        velocity = self.velocities(motion)
         carried = velocity[:, self.dynamics.carrier]
         turning = cross(carried[..., :3], own[..., :3])
         moving = cross(carried[..., :3], own[..., 3:]) + cross(carried[..., 3:], own[..., :3])

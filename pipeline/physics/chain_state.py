@@ -22,7 +22,7 @@ def require_chains(world: World) -> None:
 
     Raises:
         InputDataError: If one is not, with the chain and the body or joint.
-        UsageError: If the world has effects or a contact law that do not act on links.
+        UsageError: If the world has a contact law that does not act on links.
     """
     names = [joint.name for chain in world.chains for joint in chain.joints]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -39,13 +39,6 @@ def require_chains(world: World) -> None:
         return
     if world.contact.name != "closed_form":
         raise UsageError("the published contact law does not know jointed bodies.", "the contact law closed_form.")
-    acting = [active.effect.name for active in world.effects if active.effect.has("wrench")]
-    if acting:
-        raise UsageError(
-            f"the effect '{acting[0]}' acts on free bodies alone, and this world has jointed ones.",
-            "effects of contact, of gravity and of the measurement.",
-            "leave the effect out.",
-        )
 
 
 def _require_tree(world: World, chain: Chain, bodies: Mapping[str, Body], owner: dict[str, str]) -> None:

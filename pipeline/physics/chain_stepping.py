@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..geometry.rotation import cross, quat_conjugate, quat_rotate
 from .chain import Chain
-from .chain_dynamics import ChainDynamics, ChainMotion, Kick, target_of
+from .chain_dynamics import ChainDynamics, ChainMotion, Kick, LinkWrench, target_of
 from .chain_state import joints_of
 from .impulse_solver import Rows
 from .joint_command import JointCommand
@@ -75,14 +75,14 @@ class ChainStepper:
         self.motion = ChainMotion(*(x.expand(batch, *x.shape[1:]) for x in fields))
         return self.dynamics.links(self.motion)
 
-    def free(self, step_s: Tensor, time_after: Tensor) -> list[Motion]:
+    def free(self, step_s: Tensor, time_after: Tensor, wrench: LinkWrench | None = None) -> list[Motion]:
         """Return the motions of the links after the forces of a step, without contact, at the poses of its start."""
         self.ahead = None
         if self.drive is not None:
             root = self.drive.at(time_after)
             self.ahead = Motion(*(x.expand(step_s.shape[0], *x.shape[1:]) for x in vars(root).values()))
         target = target_of(self.command, time_after)
-        self.kicked = self.dynamics.kick(self.motion, step_s, self.gravity, target, self.ahead)
+        self.kicked = self.dynamics.kick(self.motion, step_s, self.gravity, target, self.ahead, wrench)
         self.rows = JointRows.of(self.dynamics, self.root, self.motion, self.kicked, step_s)
         return self.dynamics.links(self.dynamics.with_speed(self.motion, self.kicked.speed))
 

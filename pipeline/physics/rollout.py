@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...schemas import NotConvergedError
 from ..geometry.rotation import quat_to_matrix
+from .chain_dynamics import CentralMotion
 from .chain_stepping import ChainStepper
 from .checks import require_physical, require_state
 from .contact_detection import Placed
@@ -186,7 +187,8 @@ class Engine:
         ]
         time = self.times[:, interval - 1] + (substep + 1) * self.lengths[:, interval - 1] / count
         for chain in self.chains:
-            for index, motion in zip(chain.dynamics.indices, chain.free(h, time), strict=True):
+            wrench = self._on_link if self.wrenches else None
+            for index, motion in zip(chain.dynamics.indices, chain.free(h, time, wrench), strict=True):
                 ahead[index] = self._whole(motion)
         touched = self.contacts.resolve(self._place(ahead, rotations), h, self.touched)
         self.touched = touched
@@ -211,7 +213,8 @@ class Engine:
         if not self.wrenches:
             return replace(motion, velocity=velocity)
         inertia = self.inertias[index]
-        current = self._body_motion(index, motion, rotation)
+        omega = inertia.omega(rotation, motion.spin)
+        current = self._body_motion(index, CentralMotion(motion.com, rotation, motion.velocity, omega))
         for active in self.wrenches:
             wrench = active.effect.wrench(active.values, current)
             if wrench.force is not None:
@@ -219,6 +222,16 @@ class Engine:
             if wrench.torque is not None:
                 spin = spin + h[:, None] * wrench.torque
         return replace(motion, velocity=velocity, spin=spin)
+
+    def _on_link(self, index: int, link: CentralMotion) -> tuple[Tensor, Tensor]:
+        """Return what all effects do to a link: force (B, 3) [N] and torque (B, 3) [N m] about its centre of mass."""
+        force, torque = torch.zeros_like(link.velocity), torch.zeros_like(link.velocity)
+        current = self._body_motion(index, link)
+        for active in self.wrenches:
+            wrench = active.effect.wrench(active.values, current)
+            force = force if wrench.force is None else force + wrench.force
+            torque = torque if wrench.torque is None else torque + wrench.torque
+        return force, torque
 
     def loads(self, motions: Sequence[Motion]) -> dict[int, tuple[Tensor, Tensor]]:
         """Return the effect on each free body now: acceleration (B, 3) [m/s2] and torque (B, 3) [N m], world frame."""
@@ -230,11 +243,10 @@ class Engine:
                 found[index] = after.velocity - motion.velocity - self.world.gravity, after.spin - motion.spin
         return found
 
-    def _body_motion(self, index: int, motion: Motion, rotation: Tensor) -> BodyMotion:
-        """Return the motion of a free body as effects receive it."""
+    def _body_motion(self, index: int, motion: CentralMotion) -> BodyMotion:
+        """Return the motion of a free body or link as effects receive it."""
         body, inertia, world = self.world.bodies[index], self.inertias[index], self.world
-        omega = inertia.omega(rotation, motion.spin)
-        turned = rotation @ inertia.matrix @ rotation.transpose(-1, -2)
+        turned = motion.rotation @ inertia.matrix @ motion.rotation.transpose(-1, -2)
         up, offset = world.up, world.ground_offset
         normal = up if world.ground_normal is None else world.ground_normal[None]
         current = BodyMotion(
@@ -242,9 +254,9 @@ class Engine:
             mass=inertia.mass,
             inertia=turned,
             com=motion.com,
-            rotation=rotation,
+            rotation=motion.rotation,
             velocity=motion.velocity,
-            omega=omega,
+            omega=motion.omega,
             up=up,
             normal=normal,
             ground_offset=offset,

@@ -146,6 +146,13 @@ def _require_needs(world: World, episodes: Sequence[Episode]) -> None:
     """Refuse effects that need what the world or the episodes do not have."""
     present = _present(world, episodes)
     for effect in (active.effect for active in world.effects):
+        if world.chains and (effect.phase == "contact" or set(effect.needs) & set(_NEEDS)):
+            raise InputDataError(
+                f"the effect '{effect.name}' with a jointed body: effects on it are fitted to the centre of mass of "
+                "its links, in flight, which neither turns nor touches anything.",
+                "effects of flight, of gravity and of the measurement that need neither contact nor orientations.",
+                "leave it out of --effects.",
+            )
         lacking = next((need for need in effect.needs if need in _NEEDS and need not in present), None)
         if lacking is not None:
             raise InputDataError(

@@ -46,6 +46,7 @@ from ...physics.parameters import (
 )
 from ...physics.world import World
 from ...runtime.resources import one_torch_thread
+from ...segments.center_of_mass import as_one_body
 from ...segments.first_contact_fit import EffectEstimate
 from ...segments.fitted_parameters import bound_warnings
 from ...segments.restitution_fit import RestitutionFit, restitution_of
@@ -258,7 +259,10 @@ def _fitted_before(
         # a scale alone is known far better than it matters from the episodes of the search
         only_scale = [active.effect.name for active in world.effects] == [SCALE]
         episodes = data.searched if only_scale else data.episodes
-        effects = _effects_beside(at, episodes, [] if data.airborne else start, data.noise, groups, earlier)
+        if world.chains:
+            effects = _effects_on_whole(at, episodes, data.noise, groups, earlier)
+        else:
+            effects = _effects_beside(at, episodes, [] if data.airborne else start, data.noise, groups, earlier)
     if effects is not None:
         world = replace(effects.world, touching=world.touching, step_s=world.step_s)
         start = [(p, effects.contact_start.get(p.name, value)) for p, value in start]
@@ -282,6 +286,26 @@ def _effects_beside(
     if not lost:
         return found
     return fit_effects(world, episodes, along, noise, groups, lost) if len(lost) < len(world.effects) else None
+
+
+def _effects_on_whole(
+    world: World,
+    episodes: Sequence[Episode],
+    noise: Noise,
+    groups: Mapping[str, str] | None,
+    earlier: EarlierEstimates,
+) -> EffectEstimate | None:
+    """Return the effects on a jointed body, fitted to the flights of the centre of mass of its links."""
+    alone, flown = as_one_body(world, episodes, noise, world.source or "the capture")
+    if not flown:
+        raise InputDataError(
+            f"'{alone.bodies[0].name}' flies in no episode without touching anything.",
+            "flights: effects on jointed bodies are fitted to their centre of mass.",
+            "leave --effects out, or add throws.",
+        )
+    own = estimate_noise([track for _, tracks in flown for track in tracks.values()])
+    found = _effects_beside(alone, flown, [], own, groups, earlier)
+    return None if found is None else replace(found, world=replace(world, effects=found.world.effects))
 
 
 def _with_chosen_parts(

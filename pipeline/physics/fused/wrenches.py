@@ -58,6 +58,8 @@ def reason_against(world: World) -> str | None:
     for kind in _SURFACE:
         if sum(isinstance(effect, kind) for effect in acting) > 1:
             return f"the kernel takes one {kind.name}, and it has several"
+    if world.chains and any(isinstance(effect, GroundMagnet) for effect in acting):
+        return f"the kernel has '{GroundMagnet.name}' for free bodies only"
     if not world.touching and any(isinstance(effect, Adhesion) for effect in acting):
         return f"the kernel finds the height for {Adhesion.name} by contacts, and its bodies do not touch anything"
     return _against_surface(world, acting)

@@ -88,8 +88,8 @@ def test_a_model_is_written_and_read_and_refused_where_joints_are_not_taken(tmp_
     assert read_model(tmp_path / "model").file == written.file
     with pytest.raises(InputDataError, match=r"M: it has jointed bodies \('arm'\), which view does not take yet"):
         refuse_joints(written.file.articulations, "M", "view")
-    with pytest.raises(InputDataError, match=r"Next: fit the numbers .* 'cgwm compare M C' shows in which phase"):
-        refuse_joints(written.file.articulations, "M", "diagnose", INSTEAD.format(model="M", capture="C"))
+    with pytest.raises(InputDataError, match=r"Next: 'cgwm diagnose M C' names .* 'cgwm fit --from M --effects'"):
+        refuse_joints(written.file.articulations, "M", "improve", INSTEAD.format(model="M", capture="C"))
 
 
 def test_servos_are_position_actuators() -> None:

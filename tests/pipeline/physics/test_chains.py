@@ -16,6 +16,7 @@ from cgwm.pipeline.physics.chain_dynamics import ChainDynamics, ChainMotion, _Pl
 from cgwm.pipeline.physics.chain_parameters import chain_parameters
 from cgwm.pipeline.physics.chain_state import joints_of, on_joints, require_chains, with_joints
 from cgwm.pipeline.physics.chain_values import with_chain_values
+from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.schemas import InputDataError, UsageError
@@ -142,6 +143,28 @@ def test_a_floating_chain_keeps_its_momentum_and_its_energy() -> None:
     np.testing.assert_allclose(linear, linear[:1].expand_as(linear), atol=1e-4 * float(linear[0].norm()))
     np.testing.assert_allclose(angular, angular[:1].expand_as(angular), atol=2e-4 * float(angular[0].norm()))
     np.testing.assert_allclose(energy[0], float(energy[0, 0]) * np.ones(5), rtol=2e-4)
+
+
+def test_drag_takes_the_momentum_of_a_chain_and_a_damped_spin_its_moment() -> None:
+    chain, bodies = double_pendulum("free")
+    effects = [("linear_drag", {"c": 2.0}), ("wind", {"w_x": 0.5, "w_y": 0.0}), ("spin_damping", {"d": 2.0})]
+    acting = tuple(ActiveEffect.of(load_effect(name), values) for name, values in effects)
+    world = replace(chained(chain, *bodies, ground=False, gravity=0.0, step_s=0.002), effects=acting)
+    state = with_joints(world, still(3), {"second": 1.0}, {"first": 4.0, "second": -6.0})
+    found = rollout(world, state, times(0.2, 10.0))
+    mass = torch.cat([body.mass for body in bodies])[:, None]
+    inertia = torch.stack([body.inertia[0] for body in bodies])
+    arm = quat_rotate(found.quat_wxyz, torch.stack([body.com[0] for body in bodies]))
+    velocity = found.velocity_m_s + cross(quat_rotate(found.quat_wxyz, found.omega_body_rad_s), arm)
+    linear = (mass * velocity).sum(2)[0]
+    blown = torch.tensor([0.5, 0.0, 0.0], dtype=F64) * mass.sum()
+    left = blown + math.exp(-2.0 * 0.2) * (linear[0] - blown)
+    np.testing.assert_allclose(linear[-1], left, atol=1e-4)
+    # all links lose their momenta at one rate, so that the moment about the common centre does, too
+    middle = (mass * (found.position_m + arm)).sum(2, keepdim=True) / mass.sum()
+    own = quat_rotate(found.quat_wxyz, (inertia @ found.omega_body_rad_s[..., None]).squeeze(-1))
+    angular = (mass * cross(found.position_m + arm - middle, velocity) + own).sum(2)[0]
+    np.testing.assert_allclose(angular[-1], math.exp(-2.0 * 0.2) * angular[0], atol=5e-4 * float(angular[0].norm()))
 
 
 def test_a_double_pendulum_keeps_its_energy_for_ten_seconds() -> None:

@@ -116,9 +116,26 @@ INLINE void add_mass(const Chain& chain, const Configuration& at, Real* A) {
     }
 }
 
-// Forces that keep the generalised velocity: Coriolis, centrifugal, and against gravity; recursive Newton-Euler.
-INLINE void bias_of(const Chain& chain, const Configuration& at, const Vec* root_linear, const Vec* root_angular,
+#if EFFECTS
+// Force and its moment about the root's origin that effects exert on a link; see `apply` for free bodies.
+INLINE Spatial pushed(const Wrenches& w, const Chain& chain, const Configuration& at, int l, const Spatial& motion) {
+    Vec c = at.coms[l], omega = motion.turning, u = motion.moving + cross(omega, c) - w.wind;
+    Real drag = w.linear_drag + w.quadratic_drag * root(dot(u, u) + Real(Number(1e-24)));
+    Vec force = chain.joints[l].mass * (w.acceleration - drag * u + w.magnus * cross(omega, u));
+    Vec torque = -(w.spin_damping * (at.inertias[l] * omega));
+#if TWISTED
+    torque = torque + at.inertias[l] * w.twist;
+#endif
+    Spatial all = {torque + cross(c, force), force};
+    return all;
+}
+#endif
+
+// Forces that keep the generalised velocity: Coriolis, centrifugal, against gravity, and against effects; recursive
+// Newton-Euler.
+INLINE void bias_of(const Environment& env, const Configuration& at, const Vec* root_linear, const Vec* root_angular,
                     const Vec* root_lift, const Vec* root_twist, const Real* speed, Real* bias) {
+    const Chain& chain = env.chain;
     Spatial velocity[LINKS], change[LINKS], force[LINKS];
     for (int d = 0; d < DOFS; d++) bias[d] = Real(0);
     for (int l = 0; l < LINKS; l++) {
@@ -148,6 +165,11 @@ INLINE void bias_of(const Chain& chain, const Configuration& at, const Vec* root
         Vec w = velocity[l].turning, v = velocity[l].moving;
         force[l].turning = F.turning + cross(w, P.turning) + cross(v, P.moving);
         force[l].moving = F.moving + cross(w, P.moving);
+#if EFFECTS
+        Spatial push = pushed(env.wrenches, chain, at, l, velocity[l]);
+        force[l].turning = force[l].turning - push.turning;
+        force[l].moving = force[l].moving - push.moving;
+#endif
     }
     for (int l = LINKS - 1; l >= 0; l--) {
         int parent = link_parent[l], dof = link_dof[l];
@@ -324,7 +346,7 @@ INLINE void kick(const Problem& problem, Environment& env, Real time_after, cons
     Real bias[DOFS], mean[DOFS];
     for (int d = 0; d < DOFS; d++) mean[d] = speed[d];
     for (int pass = 0; pass < 2; pass++) {
-        bias_of(chain, at, linear, angular, lift, twist, mean, bias);
+        bias_of(env, at, linear, angular, lift, twist, mean, bias);
         for (int d = 0; d < DOFS; d++) right[d] = kept[d] - h * bias[d];
         solve_mass(A, right, chain.speed);
         for (int d = 0; d < DOFS; d++) mean[d] = Number(0.5) * (speed[d] + chain.speed[d]);

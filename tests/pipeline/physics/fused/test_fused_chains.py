@@ -12,6 +12,7 @@ from cgwm.pipeline.physics import Body, Rollout, State, World, simulate
 from cgwm.pipeline.physics.chain import Chain, Joint
 from cgwm.pipeline.physics.chain_state import with_joints
 from cgwm.pipeline.physics.devices import on_device
+from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.fused import simulate_fused
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
@@ -126,6 +127,37 @@ def test_derivatives_are_those_of_the_torch_engine(fused: Fused) -> None:
     np.testing.assert_allclose(found.cpu(), value, atol=1e-10)
     assert (jacobian.abs().amax((0, 1)) > 1e-6).all()
     np.testing.assert_allclose(derivative.cpu(), jacobian, atol=1e-8 * float(jacobian.abs().max()))
+
+
+def test_effects_act_on_links(fused: Fused) -> None:
+    """Values and derivatives by the numbers of the effects; what the kernel lacks is left to the torch engine."""
+    chain, bodies = double_pendulum("free", damping=0.01)
+    world = chained(chain, *bodies, ground=False, step_s=0.005)
+    state = with_joints(world, still(3), {"second": 1.0}, {"first": 4.0, "second": -6.0})
+    names = ("linear_drag", "quadratic_drag", "magnus_lift", "spin_damping", "buoyancy", "wind")
+    effects = [load_effect(name) for name in names]
+    keys = [(effect.name, parameter.name) for effect in effects for parameter in effect.parameters]
+
+    def moved(run: Callable[..., Rollout]) -> Callable[[torch.Tensor, int], torch.Tensor]:
+        def final(x: torch.Tensor, _: int) -> torch.Tensor:
+            given = dict(zip(keys, (0.5 + x).unbind(-1), strict=True))
+            acting = tuple(
+                ActiveEffect.of(effect, {p.name: given[effect.name, p.name] for p in effect.parameters})
+                for effect in effects
+            )
+            found = run(replace(world, effects=acting), state, times(0.03, 100.0), {})
+            return torch.cat([getattr(found, name)[:, -1].flatten(1) for name in POSES], -1)
+
+        return final
+
+    point = torch.zeros(1, len(keys), dtype=F64)
+    value, jacobian = batched_jacobian(moved(simulate), point)
+    found, derivative = batched_jacobian(moved(fused), point)
+    np.testing.assert_allclose(found.cpu(), value, atol=1e-12)
+    assert (jacobian.abs().amax((0, 1)) > 1e-6).all()
+    np.testing.assert_allclose(derivative.cpu(), jacobian, atol=1e-9 * float(jacobian.abs().max()))
+    magnet = ActiveEffect.of(load_effect("ground_magnet"), {"A": batch(1.0)})
+    assert "'ground_magnet' for free bodies only" in str(reason_against(replace(world, effects=(magnet,))))
 
 
 def test_links_without_mass_have_a_diagonal_admittance(fused: Fused) -> None:
