@@ -72,7 +72,8 @@ def descended(
         small_step=SMALL_STEP,
     )
     end = descend(problem, start, policy)
-    return Poses(*end.point.states, (end.cost / 2).to(position_m))
+    position, quat = end.point.states
+    return Poses(position, quat, (end.cost / 2).to(position_m))
 
 
 class _PoseProblem(Problem):
