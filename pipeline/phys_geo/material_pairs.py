@@ -8,7 +8,7 @@ as well: the fit estimates every pair that its episodes show.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from ...datasets.capture.capture import Capture
@@ -80,12 +80,10 @@ def require_known_pairs(capture: Capture, split: str) -> None:
         InputDataError: With the materials and the bodies of the first such pair.
     """
     known = {pair for pair, numbers in given_numbers(capture.manifest).items() if "friction" in numbers}
-    moving = {body.name for body in capture.manifest.bodies if body.motion != "fixed"}
     asked = [one for one in touching_bodies(capture.manifest) if one.pair is not None and one.pair not in known]
-    shown = [set(capture.tracks(name)) for name in capture.episodes(split)] if asked else []
-    open_pairs = {one.pair for one in asked if any(set(one.bodies) & moving <= tracked for tracked in shown)}
+    shown = _shown(capture, split, asked) if asked else set()
     for one in asked:
-        if one.pair is not None and one.pair not in open_pairs:
+        if one.pair is not None and one.pair not in shown:
             first, second = one.pair
             raise InputDataError(
                 f"{capture.root / 'capture.toml'}: nothing gives the friction of '{first}' and '{second}' (of {one}), "
@@ -93,6 +91,13 @@ def require_known_pairs(capture: Capture, split: str) -> None:
                 f'[[pairs]] with materials = ["{first}", "{second}"] and friction, or friction of both materials.',
                 "give it, or leave out the material of one of the two, which then has the contact of all other pairs.",
             )
+
+
+def _shown(capture: Capture, split: str, asked: Sequence[TouchingBodies]) -> set[Pair | None]:
+    """Return the pairs of materials whose moving bodies are tracked together in an episode."""
+    moving = {body.name for body in capture.manifest.bodies if body.motion != "fixed"}
+    tracked = [set(capture.tracks(name)) for name in capture.episodes(split)]
+    return {one.pair for one in asked if any(set(one.bodies) & moving <= names for names in tracked)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.robots import Articulation, LinkOfRobot
+from ...datasets.robots import Articulation, JointOfRobot, LinkOfRobot
 from ...schemas import UsageError
 from .chain import Chain, Joint
 from .smooth_distance import plane_contacts
@@ -57,16 +57,7 @@ def chain_of(
         InputDataError: If a joint has a servo and no limits.
     """
     like = torch.zeros((), dtype=torch.float64) if like is None else like
-    names = [joint.name for joint in articulation.joints if joint.kind != "fixed"]
-    servos = servo if isinstance(servo, Mapping) else {name: servo for name in names if servo is not None}
-    unknown = [name for name in servos if name not in names]
-    if unknown:
-        raise UsageError(f"{articulation.path}: there is no moving joint '{unknown[0]}'.", ", ".join(names) + ".")
-    joints = []
-    for joint in articulation.joints:
-        given = servos.get(joint.name)
-        changed = {} if given is None else {key: value for key, value in vars(given).items() if value is not None}
-        joints.append(replace(joint, **changed))
+    joints = _served(articulation, servo)
     served = replace(articulation, joints=tuple(joint for joint in joints if joint.stiffness > 0))
     served.require_limits()
     made = [
@@ -80,6 +71,21 @@ def chain_of(
     ]  # fmt: skip
     chain = Chain(name=articulation.name, root=articulation.links[0].name, base=base, joints=tuple(made))
     return chain, [_body(link, *spheres[link.name], massless, like) for link in articulation.links]
+
+
+def _served(articulation: Articulation, servo: Servo | Mapping[str, Servo] | None) -> list[JointOfRobot]:
+    """Return the joints of an articulated body with the numbers of their servos; arguments as in `chain_of`."""
+    names = [joint.name for joint in articulation.joints if joint.kind != "fixed"]
+    servos = servo if isinstance(servo, Mapping) else {name: servo for name in names if servo is not None}
+    unknown = [name for name in servos if name not in names]
+    if unknown:
+        raise UsageError(f"{articulation.path}: there is no moving joint '{unknown[0]}'.", ", ".join(names) + ".")
+    joints = []
+    for joint in articulation.joints:
+        given = servos.get(joint.name)
+        changed = {} if given is None else {key: value for key, value in vars(given).items() if value is not None}
+        joints.append(replace(joint, **changed))
+    return joints
 
 
 def _body(link: LinkOfRobot, centers: Array, radii: Array, massless: bool, like: Tensor) -> Body:

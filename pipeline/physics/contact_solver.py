@@ -125,21 +125,10 @@ class Contacts:
         some = [_select(body, items) for body in placed]
         h = take(step_s, items)
         found: list[tuple[int, Points, Touch, Tensor]] = []
-        for number, (_, depth, nearby) in candidates.items():
-            a, b = self.pairs[number]
-            surface = self.world.surface(b)
-            if depth is not None:
-                near = take(depth, items)
-                most = int((near < ROUNDING_M).sum(1).max())
-                slots = near.topk(most, dim=1, largest=False, sorted=False).indices
-                reached = near.gather(1, slots) < ROUNDING_M
-                if surface is None or nearby is None:
-                    points = ground_points(_on(self.world, items), some[a], slots, reached)
-                else:
-                    points = surface_points(some[a], _selected(surface, items), nearby.at(items), slots, reached)
-            else:
-                points = body_points(some[a], some[b], h, self.sharpness_per_m)
+        for number, (_, gaps, nearby) in candidates.items():
+            points = self._points(number, gaps, nearby, some, items, h)
             if points is not None:
+                a, b = self.pairs[number]
                 law = self.world.law_of(a, b)
                 touch, axes = self._touch(points, some[a], None if b < 0 else some[b], law, h, items, b == GROUND)
                 found.append((number, points, touch, axes))
@@ -147,30 +136,61 @@ class Contacts:
             return self._joints_alone()
         warm = self._warm(found, items, before, step_s.shape[0])
         impulses = self._impulses(found, some, items, warm)
-        results = []
-        for (number, points, touch, axes), impulse in zip(found, impulses, strict=True):
-            a, b = self.pairs[number]
-            free = (True, b >= 0 and self.world.moves(b))
-            world_impulse = (impulse.linear[..., None, :] @ axes).squeeze(-2)
-            angular = None if impulse.angular is None else (impulse.angular[..., None, :] @ axes).squeeze(-2).sum(1)
-            friction = touch.friction
-            if touch.anisotropy is not None:
-                friction = Ellipse.of(friction, touch.anisotropy).along(impulse.linear[..., 1:])
-            results.append(
-                PairImpulses(
-                    pair=number,
-                    a=a,
-                    b=b,
-                    free=free,
-                    items=items,
-                    points=points,
-                    impulse_n_s=world_impulse,
-                    along_axes_n_s=impulse.linear,
-                    angular_n_m_s=angular,
-                    friction=friction,
-                )
-            )
-        return results
+        return [self._result(one, impulse, items) for one, impulse in zip(found, impulses, strict=True)]
+
+    def _points(
+        self,
+        number: int,
+        gaps: Tensor | None,
+        nearby: Nearby | None,
+        some: Sequence[Placed],
+        items: Tensor | None,
+        step_s: Tensor,
+    ) -> Points | None:
+        """Return where a pair touches; None where it does not.
+
+        Args:
+            number: The pair.
+            gaps: Gap of each of its slots to the ground or a surface, shape (B, S) [m]; None for two bodies.
+            nearby: What is near of a surface.
+            some: The bodies of the items that may touch (b).
+            items: Indices of these items; None for all.
+            step_s: Step [s], shape (b,).
+        """
+        a, b = self.pairs[number]
+        if gaps is None:
+            return body_points(some[a], some[b], step_s, self.sharpness_per_m)
+        near = take(gaps, items)
+        most = int((near < ROUNDING_M).sum(1).max())
+        slots = near.topk(most, dim=1, largest=False, sorted=False).indices
+        reached = near.gather(1, slots) < ROUNDING_M
+        surface = self.world.surface(b)
+        if surface is None or nearby is None:
+            return ground_points(_on(self.world, items), some[a], slots, reached)
+        return surface_points(some[a], _selected(surface, items), nearby.at(items), slots, reached)
+
+    def _result(
+        self, found: tuple[int, Points, Touch, Tensor], impulse: Impulses, items: Tensor | None
+    ) -> PairImpulses:
+        """Return the impulses of a pair in the world, from those along its axes."""
+        number, points, touch, axes = found
+        a, b = self.pairs[number]
+        angular = None if impulse.angular is None else (impulse.angular[..., None, :] @ axes).squeeze(-2).sum(1)
+        friction = touch.friction
+        if touch.anisotropy is not None:
+            friction = Ellipse.of(friction, touch.anisotropy).along(impulse.linear[..., 1:])
+        return PairImpulses(
+            pair=number,
+            a=a,
+            b=b,
+            free=(True, b >= 0 and self.world.moves(b)),
+            items=items,
+            points=points,
+            impulse_n_s=(impulse.linear[..., None, :] @ axes).squeeze(-2),
+            along_axes_n_s=impulse.linear,
+            angular_n_m_s=angular,
+            friction=friction,
+        )
 
     def _joints_alone(self) -> list[PairImpulses]:
         """Solve the impulses of the joints of chains that nothing touches."""

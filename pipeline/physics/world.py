@@ -208,14 +208,16 @@ class World:
             return []
         solid = [k for k, body in enumerate(self.bodies) if body.radii.shape[-1] > 0]
         moving = [k for k in solid if self.moves(k)]
+        on_ground = [] if self.ground_normal is None else [(i, -1) for i in moving]
+        on_surfaces = [(i, -2 - s) for i in moving for s in range(len(self.surfaces))]
+        return on_ground + on_surfaces + self._between(solid, moving)
+
+    def _between(self, solid: Sequence[int], moving: Sequence[int]) -> list[tuple[int, int]]:
+        """Return the pairs of solid bodies that can touch each other, of which one at least moves: that one first."""
         chain = {k: self.chain_of(k) if self.chains else -1 for k in solid}
-        pairs = [(i, -1) for i in moving if self.ground_normal is not None]
-        pairs += [(i, -2 - s) for i in moving for s in range(len(self.surfaces))]
-        for i, j in combinations(solid, 2):
-            linked = chain[i] >= 0 and chain[i] == chain[j]
-            if not linked and (i in moving or j in moving):
-                pairs.append((i, j) if i in moving else (j, i))
-        return pairs
+        apart = [(i, j) for i, j in combinations(solid, 2) if chain[i] < 0 or chain[i] != chain[j]]
+        ordered = [(i, j) if i in moving else (j, i) for i, j in apart]
+        return [pair for pair in ordered if pair[0] in moving]
 
     @property
     def laws(self) -> tuple[ContactLaw | PaperLaw, ...]:

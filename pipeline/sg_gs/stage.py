@@ -78,33 +78,43 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     if stage.train and config.refine_poses:
         refine_poses(stage)
     pictures = _separated(stage)
+    results, placed = _bodies(stage)
+    scene = fit_background(stage, placed) if stage.train else None
+    if stage.train:
+        pictures |= _checked(stage, placed, scene)
+    stage.record["seconds"] = round(time.perf_counter() - started, 2)
+    return SgGsResult(
+        bodies=results,
+        scene=None if scene is None else scene.to_numpy(),
+        radius_factor=config.radius_factor,
+        record=stage.record,
+        warnings=tuple(stage.warnings),
+        pictures=pictures,
+        cameras=_refined_cameras(stage),
+    )
+
+
+def _bodies(stage: Stage) -> tuple[dict[str, BodyResult], list[Spheres]]:
+    """Return the results of all bodies, and the visual spheres of those that photos show, where they lie."""
+    links = link_results(stage.capture, stage.config)
     results: dict[str, BodyResult] = {}
     placed: list[Spheres] = []
-    links = link_results(capture, config)
-    for index, body in enumerate(capture.manifest.bodies):
+    for index, body in enumerate(stage.capture.manifest.bodies):
         if body.name in links:
             results[body.name] = links[body.name]
             continue
         results[body.name], world = fit_body(stage, index, body)
         if world is not None:
             placed.append(world)
-    scene = fit_background(stage, placed) if stage.train else None
-    if stage.train:
-        pictures |= _checked(stage, placed, scene)
-    stage.record["seconds"] = round(time.perf_counter() - started, 2)
-    splats = None if scene is None else scene.to_numpy()
-    cameras = capture.cameras if stage.train and config.refine_poses else None
-    if cameras is not None:
-        cameras = posed(cameras, {view.name: view.camera.T_world_cam for view in stage.train})
-    return SgGsResult(
-        bodies=results,
-        scene=splats,
-        radius_factor=config.radius_factor,
-        record=stage.record,
-        warnings=tuple(stage.warnings),
-        pictures=pictures,
-        cameras=cameras,
-    )
+    return results, placed
+
+
+def _refined_cameras(stage: Stage) -> CamerasFile | None:
+    """Return the cameras of the photos with their refined poses; None if they were not refined."""
+    cameras = stage.capture.cameras
+    if cameras is None or not (stage.train and stage.config.refine_poses):
+        return None
+    return posed(cameras, {view.name: view.camera.T_world_cam for view in stage.train})
 
 
 def _checked(stage: Stage, bodies: list[Spheres], scene: Spheres | None) -> dict[str, bytes]:
