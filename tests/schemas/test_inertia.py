@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cgwm.pipeline.physics.world import inertia_elements, symmetric
 from cgwm.schemas.capture import physical_inertia
 
 
@@ -29,3 +30,8 @@ def test_a_moment_above_the_sum_of_the_others_is_refused_in_every_orientation(se
         physical_inertia(_turned([1.0, 1.5, 2.7], seed))
     with pytest.raises(ValueError, match="positive definite"):
         physical_inertia(_turned([1.0, 1.2, -0.1], seed))
+
+
+def test_elements_of_a_symmetric_matrix_and_back() -> None:
+    six = (1.0, 2.0, 3.0, 0.1, 0.2, 0.3)
+    assert inertia_elements(symmetric(six)) == six

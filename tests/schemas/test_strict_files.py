@@ -30,6 +30,7 @@ from cgwm.schemas import (
 )
 from cgwm.schemas.diagnose import ThrowsFile
 from cgwm.schemas.documents import MAX_DEPTH, parse_json, parse_toml
+from cgwm.schemas.plan import RejectionRules
 
 CAPTURE = """format = "cgwm-capture/1"
 [world]
@@ -354,3 +355,10 @@ def test_a_wrong_value_is_shown_unless_it_is_a_table(tmp_path: Path, value: str,
     with pytest.raises(InputDataError) as error:
         read_toml(tmp_path / "capture.toml", CaptureManifest)
     assert f"capture.toml, line 3: {words}" in str(error.value)
+
+
+def test_a_plan_to_edit_explains_each_rule_and_a_short_one_nothing() -> None:
+    text, short = plan_toml(SamplingPlan()), plan_toml(SamplingPlan(), comments=False)
+    for name, field in RejectionRules.model_fields.items():
+        assert f"# {' '.join(str(field.description).split())}" in text and name in text
+    assert "#" not in short and tomllib.loads(short) is not None

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from cgwm.pipeline.geometry.rotation import cross, quat_rotate
+from cgwm.pipeline.geometry.rotation import cross, quat_multiply, quat_rotate
 from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import Body, State, World, simulate
 from cgwm.pipeline.physics.chain import Chain, Joint
@@ -445,3 +445,43 @@ def test_a_repeated_command_has_the_rows_of_the_batch() -> None:
     assert torch.equal(again.coefficients[2:4], command.coefficients)
     shared = JointCommand.targets(torch.tensor([[0.0, 1.0]], dtype=F64), values[:1])
     assert shared.repeat(3).coefficients.shape == shared.coefficients.shape
+
+
+def test_pieces_of_a_cubic_command_end_where_the_next_begins_and_follow_a_parabola() -> None:
+    knots = torch.tensor([[0.0, 0.3, 0.5, 1.1, 1.4]], dtype=F64)
+    values = torch.stack([knots.square() - knots, knots.sin()], -1)
+    pieces = JointCommand.targets(knots, values, "cubic").coefficients
+    step = knots.diff(dim=1)[..., None]
+    powers = torch.stack([step**k for k in range(5)], -1)
+    rates = torch.stack([k * step ** max(k - 1, 0) for k in range(5)], -1)
+    torch.testing.assert_close((pieces[:, :-1] * powers).sum(-1), values[:, 1:])
+    torch.testing.assert_close((pieces[:, :-2] * rates[:, :-1]).sum(-1), pieces[:, 1:-1, :, 1])
+    inner = pieces[0, 1:3, 0]  # the first and the last piece have one-sided slopes
+    expected = torch.stack([2 * knots[0, 1:3] - 1, torch.ones(2, dtype=F64), torch.zeros(2, dtype=F64)], -1)
+    torch.testing.assert_close(inner[:, 1:4], expected)
+
+
+@pytest.mark.parametrize(("shift", "turn"), [(1.5e-5, 0.0), (0.0, 1.5e-4)])
+def test_a_link_off_its_joint_by_more_than_rounding_is_refused(shift: float, turn: float) -> None:
+    chain, bodies = double_pendulum()
+    world = chained(chain, *bodies)
+    state = with_joints(world, still(3), {"first": 0.2})
+    joints_of(world, state, chain)
+    state.position_m[:, 1] += torch.tensor([shift, 0.0, 0.0], dtype=F64)
+    axis = chain.joints[0].axis[0].roll(1)  # across the hinge
+    half = torch.cat([torch.ones(1, dtype=F64), 0.5 * turn * axis])
+    state.quat_wxyz[:, 1] = quat_multiply(state.quat_wxyz[:, 1], half)
+    with pytest.raises(InputDataError, match="off its joint 'first'"):
+        joints_of(world, state, chain)
+
+
+def test_priors_of_a_chain_scale_with_its_weight_and_factors_are_as_free_upwards_as_downwards() -> None:
+    chain, bodies = double_pendulum("free")
+    light = {p.name: p for p in chain_parameters(chained(chain, *bodies))}
+    heavier = [replace(body, mass=3 * body.mass, inertia=3 * body.inertia) for body in bodies]
+    heavy = {p.name: p for p in chain_parameters(chained(chain, *heavier))}
+    for name in ("first.friction", "second.damping"):
+        assert heavy[name].prior[0] == pytest.approx(3 * light[name].prior[0], rel=1e-9)
+        assert light[name].bounds[0] < light[name].prior[0] < light[name].bounds[1]
+    for name in ("lower.mass_factor", "arm.inertia_factor"):
+        assert light[name].prior[0] == 1.0 and light[name].bounds[0] * light[name].bounds[1] == pytest.approx(1.0)

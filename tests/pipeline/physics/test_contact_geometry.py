@@ -15,7 +15,7 @@ from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.hull import Hull, hull_distance
 from cgwm.pipeline.physics.impulse_solver import tangent_axes
 from cgwm.pipeline.physics.rollout import require_finite
-from cgwm.pipeline.physics.rollout_cost import rollout_seconds
+from cgwm.pipeline.physics.rollout_cost import rollout_part, rollout_seconds
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.physics.world import Body
 from cgwm.schemas import NotConvergedError
@@ -88,6 +88,15 @@ def test_more_bodies_cost_more() -> None:
     one = rollout_seconds(world_of(ball_body(0.04)), 10, 1.0)
     two = rollout_seconds(world_of(ball_body(0.04), ball_body(0.04, name="two")), 10, 1.0)
     assert 0 < one < two and rollout_seconds(world_of(ball_body(0.04)), 20, 1.0) == pytest.approx(2 * one, rel=0.2)
+
+
+def test_work_grows_with_contacts_and_kept_frames() -> None:
+    ball, box = world_of(ball_body(0.04)), world_of(box_body())
+    alone = rollout_seconds(world_of(box_body(), ground=False), 10, 1.0)
+    assert alone < rollout_seconds(ball, 10, 1.0) < rollout_seconds(box, 10, 1.0)
+    two = world_of(ball_body(0.04), ball_body(0.04, name="two"))
+    parts = [rollout_part("search", world, (1.0, 0.5), 6, 4, 100).memory_bytes for world in (ball, two)]
+    assert parts[1] == 2 * parts[0] == 2 * 4 * 100 * 13 * 8
 
 
 def test_the_distance_to_a_hull_is_that_to_its_support_function() -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.phys_geo.tracks.contact_fit import RestitutionFit, damping_of, restitution_of
 from cgwm.pipeline.physics.contact_law import restitution
+from cgwm.pipeline.segments.bounces import BounceSide, _turns
 from cgwm.pipeline.segments.restitution_fit import DRAG_PRIOR, SHAKEN_S, _Flight, _Flights, _Noise, _Solved
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from helpers.worlds import ball_body, world_of
@@ -131,3 +134,13 @@ def test_flights_are_solved_as_one_linear_model() -> None:
     left = height - design @ solution
     cost = np.linalg.slogdet(cover)[1] + np.linalg.slogdet(normal)[1] + left @ weight @ left + (drag / DRAG_PRIOR) ** 2
     assert found.cost == pytest.approx(cost)
+
+
+def test_thinned_frames_keep_both_ends_and_a_ball_that_stays_down_does_not_bounce() -> None:
+    time = np.arange(12) * 0.01
+    fall = np.clip(0.06 - 1.2 * time, 0.012, None)
+    side = BounceSide(time_s=time, height_m=fall, position_m=np.zeros((12, 3)))
+    assert side.thinned(4).time_s.tolist() == pytest.approx([time[k] for k in (0, 4, 7, 11)])
+    assert _turns(side) == []
+    rising = replace(side, height_m=np.where(time > 0.041, 0.012 + 0.8 * (time - 0.04), fall))
+    assert _turns(rising) == [4]

@@ -7,6 +7,8 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics.parameters import Parameter
+from cgwm.pipeline.segments.first_contact_fit import _prior
+from cgwm.pipeline.segments.held_out_gain import HeldOutGain
 from cgwm.pipeline.segments.segment_fit import Linear, Refit, robust_excess
 from cgwm.pipeline.segments.segments import Segments
 from cgwm.pipeline.trajectories.observations import Observations
@@ -78,3 +80,19 @@ def test_the_error_of_a_logarithm_is_that_of_the_number_times_it(logarithmic: bo
         by_segment=(),
     )
     assert fit.number("c") == pytest.approx((2.0, error))
+
+
+def test_the_standard_error_of_a_gain_is_that_of_a_sum_of_independent_episodes() -> None:
+    gains, misfit = np.array([1.0, 2.5, -0.5, 4.0]), 20.0
+    variance = np.mean([(a - b) ** 2 / 2 for k, a in enumerate(gains) for b in gains[:k]])
+    assert HeldOutGain(gains, misfit).std_error == pytest.approx(math.sqrt(len(gains) * variance) / misfit)
+
+
+def test_only_wanted_parameters_have_a_prior_in_windows_of_first_contacts() -> None:
+    parameters = [
+        Parameter(name=name, unit="1", bounds=(0.01, 10.0), logarithmic=True, reveals="", prior=(median, 0.5))
+        for name, median in (("a", 0.3), ("b", 2.0))
+    ]
+    centre, information = _prior(parameters, 1, torch.zeros((), dtype=F64))
+    torch.testing.assert_close(centre, torch.tensor([0.3, 2.0], dtype=F64).log())
+    assert information.tolist() == [pytest.approx(1 / 0.5**2), 0.0]

@@ -1,0 +1,46 @@
+"""Pictures of reports: colours of masks, the window in which an object moves, outlines, and small files."""
+
+import cv2
+import numpy as np
+from cgwm.pipeline.rendering.contact_sheets import (
+    FrameStrip,
+    _outline,
+    _window,
+    label_colors,
+    small_png,
+)
+
+
+def test_bodies_have_colours_of_their_own_and_the_background_none() -> None:
+    colors = label_colors(np.arange(6, dtype=np.uint8)[None])[0]
+    assert len({tuple(color) for color in colors[:5]}) == 5
+    assert (colors[5] == colors[1]).all() and colors[0].sum() < 128
+
+
+def test_the_window_is_centred_on_what_moves_with_a_margin() -> None:
+    masks = np.zeros((2, 120, 160), np.uint8)
+    masks[0, 40:60, 70:80] = 1
+    masks[1, 50:70, 80:100] = 2  # together rows 40 to 70, columns 70 to 100
+    frames = np.zeros((2, 120, 160, 3), np.uint8)
+    strip = FrameStrip(episode="a", camera="c", times_s=np.arange(2.0), real=frames, predicted=frames, masks=masks)
+    left, top, width, height = _window(strip)
+    assert abs(left + width / 2 - 85) <= 1 and abs(top + height / 2 - 55) <= 1
+    assert 1.2 * 30 <= height <= 1.5 * 30 and abs(width / height - 4 / 3) < 0.05
+
+
+def test_an_outline_lies_on_the_edge_of_the_mask() -> None:
+    frame, mask = np.zeros((60, 60, 3), np.uint8), np.zeros((60, 60), np.uint8)
+    mask[20:40, 20:40] = 1
+    _outline(frame, mask)
+    drawn = frame.sum(-1) > 0
+    assert drawn[20, 20:40].all() and drawn[20:40, 39].all()
+    assert not drawn[23:37, 23:37].any() and not drawn[:17].any()
+
+
+def test_a_small_picture_keeps_its_brightness() -> None:
+    rng = np.random.default_rng(0)
+    image = np.clip(cv2.GaussianBlur(rng.normal(100, 200, (80, 80, 3)), (0, 0), 3), 0, 255).astype(np.uint8)
+    data = small_png(image, 5000)
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert len(data) <= 5000 and found is not None
+    assert abs(float(found.mean()) - float(image.mean())) < 3
