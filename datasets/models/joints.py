@@ -7,15 +7,10 @@ from collections.abc import Sequence
 from ...schemas import Articulation, ArticulationModel, InputDataError
 
 TAKEN_BY = (
-    "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval', 'compare', 'diagnose', 'synthesize', 'view', 'export' "
-    "and ClosedLoop take jointed bodies"
+    "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval', 'compare', 'diagnose', 'improve', 'synthesize', 'view', "
+    "'export' and ClosedLoop take jointed bodies"
 )
 """What does."""
-INSTEAD = (
-    "'cgwm diagnose {model} {capture}' names what acts on the whole in flight, 'cgwm fit --from {model} --effects' "
-    "adds it, and 'cgwm compare' shows in which phase of the motion, and at which link, short predictions miss"
-)
-"""What to do instead of `improve`."""
 
 
 def refuse_joints(

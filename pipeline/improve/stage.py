@@ -14,7 +14,6 @@ from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note
 from ...datasets.models.effect_files import effect_file
 from ...datasets.models.fit_inputs import versions
-from ...datasets.models.joints import INSTEAD, refuse_joints
 from ...datasets.models.model import read_model, write_model
 from ...schemas import (
     ImproveConfig,
@@ -157,8 +156,6 @@ def improve(
         throws=throws,
         accept_units=accepted,
     )
-    instead = INSTEAD.format(model="MODEL", capture=capture)
-    refuse_joints(request.capture.manifest.articulations, str(capture), "improve", instead)
     episodes = request.capture.episodes(split)
     inputs = request.inputs()
     if finished and (resume or not overwrite) and (kept := _kept(request, inputs, overwrite)) is not None:

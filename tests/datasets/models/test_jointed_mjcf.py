@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from cgwm.datasets.models.joints import INSTEAD, refuse_joints
+from cgwm.datasets.models.joints import refuse_joints
 from cgwm.datasets.models.mjcf import write_mjcf
 from cgwm.datasets.models.model import Model, read_model, write_model
 from cgwm.datasets.robots import read_articulation
@@ -88,8 +88,6 @@ def test_a_model_is_written_and_read_and_refused_where_joints_are_not_taken(tmp_
     assert read_model(tmp_path / "model").file == written.file
     with pytest.raises(InputDataError, match=r"M: it has jointed bodies \('arm'\), which view does not take yet"):
         refuse_joints(written.file.articulations, "M", "view")
-    with pytest.raises(InputDataError, match=r"Next: 'cgwm diagnose M C' names .* 'cgwm fit --from M --effects'"):
-        refuse_joints(written.file.articulations, "M", "improve", INSTEAD.format(model="M", capture="C"))
 
 
 def test_servos_are_position_actuators() -> None:
