@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from ...schemas import Articulation, ArticulationModel, InputDataError
 
 TAKEN_BY = (
-    "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval', 'compare', 'diagnose', 'improve', 'synthesize', 'view', "
-    "'export' and ClosedLoop take jointed bodies"
+    "'cgwm import elbow', 'validate', 'fit' (to tracks), 'eval', 'compare', 'diagnose', 'improve', 'synthesize', "
+    "'view', 'export' and ClosedLoop take jointed bodies"
 )
 """What does."""
 
