@@ -23,6 +23,7 @@ from ..segments.segment_fit import Refit, refit
 from ..segments.segments import Segments
 from ..trajectories.innovations import WHITE
 from .evidence import Evidence
+from .falsification import Repetition, repetition
 from .score_test import ScoreTest, canonical_correlation, gain_by_episode, score_test
 from .thresholds import THRESHOLDS
 
@@ -110,6 +111,7 @@ def select_next(
     if not significant:
         return SelectionStep(tuple(evidence), tuple(evidence[:1]), False)
     done = _refitted_shortlist(significant, flight, world, linear, kept, variants, dispersion)
+    done = [replace(e, repetition=_repetition(e, linear, kept, variants, dispersion)) for e in done]
     if not done:
         return SelectionStep(tuple(evidence), tuple(evidence[:1]), False)
     names = {e.name: e for e in done}
@@ -117,7 +119,7 @@ def select_next(
     equals = _equals(done, linear, kept, variants, dispersion)
     if flight.noise_model != WHITE:
         equals = _with_unproven(equals, done, linear.episode)
-    named = not any(is_slight(e) for e in equals) and (flight.noise_model == WHITE or predicts_episodes(equals[0]))
+    named = not any(is_slight(e) for e in equals) and (flight.noise_model == WHITE or repeats(equals[0], len(evidence)))
     return SelectionStep(tuple(ranking), tuple(equals), named)
 
 
@@ -147,13 +149,30 @@ def _refitted_shortlist(
     return [e for e in best.values() if e.delta_bic is not None and e.delta_bic < 0]
 
 
-def predicts_episodes(evidence: Evidence) -> bool:
-    """Return whether an effect predicts held-out episodes without the one that gains most, too.
+def repeats(evidence: Evidence, tested: int) -> bool:
+    """Return whether one of many effects is significant beside the scatter between episodes, and not by one alone.
 
     No model of correlated errors is exact: a burst, the smeared edge of a contact or the rest of a hand looks like a
     force, in its own episode.
     """
-    return sum(evidence.gains) - max(evidence.gains, default=0.0) > LIMITS.repeated_gain
+    found, level = evidence.repetition, LIMITS.alpha / max(1, tested)
+    return found is not None and found.p_value < level and found.without_best < LIMITS.without_best
+
+
+def _repetition(
+    evidence: Evidence,
+    linear: Linearization,
+    candidates: Sequence[Candidate],
+    variants: Sequence[Variant],
+    dispersion: float,
+) -> Repetition:
+    """Return whether a candidate repeats from episode to episode, at the constants of its evidence."""
+    return repetition(linear, linear.columns(_variant(evidence, candidates, variants).parameters), dispersion)
+
+
+def _variant(evidence: Evidence, candidates: Sequence[Candidate], variants: Sequence[Variant]) -> Variant:
+    """Return the variant of a candidate at the constants of its evidence."""
+    return next(v for v in variants if candidates[v.place] is evidence.candidate and v.constants == evidence.constants)
 
 
 def is_slight(evidence: Evidence) -> bool:
@@ -243,8 +262,9 @@ def _with_unproven(equals: Sequence[Evidence], done: Sequence[Evidence], episode
 
     Simplest is what acts alone, then what has the fewest parameters: a wind acts through a drag, a tilt does not.
 
-    Beside correlated errors a difference counts where it is the same from episode to episode (a paired t-test): no
-    model of such errors is exact, and a misfit of one episode is one error, not one in each frame.
+    Beside correlated errors a difference counts where it is the same from episode to episode (a paired t-test), or
+    large beside what the episodes scatter: no model of such errors is exact, and a misfit of one episode is one error,
+    not one in each frame.
 
     Args:
         equals: The best refitted candidate and those that explain the data equally well.
@@ -259,9 +279,11 @@ def _with_unproven(equals: Sequence[Evidence], done: Sequence[Evidence], episode
         worse = (other.refitted.by_segment[0] - best.refitted.by_segment[0]).numpy()
         own = np.array([worse[episode == one].sum() for one in np.unique(episode)])
         error = float(np.std(own, ddof=1)) / math.sqrt(len(own)) if len(own) > 1 else math.inf
-        more = len(best.candidate.effect.parameters) - len(other.candidate.effect.parameters)
         # what the better one gains by its further parameters in the data that they are fitted to is no evidence
-        if float(own.mean()) - max(more, 0) / len(own) <= LIMITS.paired_t * error:
+        more = max(len(best.candidate.effect.parameters) - len(other.candidate.effect.parameters), 0)
+        scatter = best.repetition.scatter if best.repetition is not None else math.inf
+        differs = float(own.sum()) - more > LIMITS.paired_t**2 * scatter
+        if not differs and float(own.mean()) - more / len(own) <= LIMITS.paired_t * error:
             found.append(other)
     return sorted(found, key=_complexity)
 
@@ -276,10 +298,7 @@ def _contains(
     linear: Linearization, candidates: Sequence[Candidate], variants: Sequence[Variant], best: Evidence, other: Evidence
 ) -> bool:
     """Return whether another effect, with more parameters, can imitate the best one."""
-    columns = []
-    for one in (best, other):
-        mine = [v for v in variants if candidates[v.place] is one.candidate and v.constants == one.constants]
-        columns.append(linear.columns(mine[0].parameters))
+    columns = [linear.columns(_variant(one, candidates, variants).parameters) for one in (best, other)]
     return canonical_correlation(linear, columns[0], columns[1]) > LIMITS.contained
 
 

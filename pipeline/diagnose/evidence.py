@@ -10,6 +10,7 @@ import numpy as np
 
 from ..segments.candidates import Candidate
 from ..segments.segment_fit import Refit
+from .falsification import Repetition
 from .score_test import ScoreTest
 
 
@@ -31,6 +32,8 @@ class Evidence:
     """Refit with the effect; None where it was not refitted."""
     delta_bic: float | None = None
     """Change of BIC against the model without the effect; None where it was not refitted."""
+    repetition: Repetition | None = None
+    """Whether it repeats beside the scatter between episodes; None where it was not refitted."""
     numbers: dict[str, tuple[float, float]] | None = None
     """Estimate and standard error by parameter; None where only the score test was made."""
     score: float = -math.inf

@@ -1,25 +1,30 @@
-"""Consistency test of selected effects: the same parameters in every episode and segment.
+"""Consistency of effects: the same parameters in every episode and segment, or as far as episodes scatter.
 
 A force that depends on time or place may look like one drag or tilt in one episode and like another in the next. With
 the information M_u and score g_u of each unit u (an episode, a segment) at the fitted parameters, and their sums M and
 g, the statistic sum_u g_u' M_u^-1 g_u - g' M^-1 g is distributed as chi2. Its degrees of freedom are the number of
 parameters of all units less those of the common fit (Cochran's Q for several parameters).
+
+The same statistic tells how far a noise model can be believed: an effect that is the same in all episodes leaves a Q of
+its degrees of freedom where the model is right. Few episodes determine that ratio badly, so that the model counts for
+some more, as in moderated tests (Smyth 2004): with d of these, the scatter is (d + Q) / (d + dof), and the statistic of
+an effect over it is distributed as F.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optimization.uncertainty import chi2_tail
+from ..optimization.uncertainty import chi2_tail, f_tail, few_covariance
 from ..physics.world import World
 from ..segments.candidates import base_values
-from ..segments.linearization import Linearization, linearize
+from ..segments.linearization import Linearization, layout, linearize, sums, widths
 from ..segments.segments import Segments
-from .score_test import solved
+from .score_test import score_test, solved
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -91,3 +96,96 @@ def _over(
     excess = max(statistic - dof, 0.0)
     share = shared / (shared + excess) if shared + excess > 0 else 1.0
     return Consistency(statistic, dof, chi2_tail(statistic, dof) if dof > 0 else 1.0, share)
+
+
+def fitted_numbers(
+    flight: Segments, world: World, names: Sequence[str], groups: Sequence[int], dispersion: float
+) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return the parameters of effects of a world with standard errors that hold the scatter between episodes.
+
+    The error of an effect's formula and what a session or a flight has of its own are common to all frames of an
+    episode, so that the information of the frames alone makes intervals too narrow.
+
+    Args:
+        flight: Segments with states fitted by the world.
+        world: The world with the effects at their fitted parameters.
+        names: Names of effects with one value for all episodes.
+        groups: Session of each episode.
+        dispersion: Factor by which variances exceed those of the noise.
+
+    Returns:
+        Value and standard error by parameter, by effect.
+    """
+    linear = linearize(flight, world, (), groups, robust=False) if names else None
+    if linear is None:
+        return {}
+    every = list(range(len(linear.parameters)))
+    bare = replace(linear, prior=np.zeros_like(linear.prior))
+    information, score = sums(bare, every)
+    scores = np.array([sums(bare.only_episode(int(one)), every)[1] for one in np.unique(linear.episode)])
+    prior = sums(linear, every)[0] - information
+    # a fit that stopped early has a slope left, which is no scatter
+    scores = (scores - score / len(scores)) / dispersion
+    std = np.sqrt(np.diag(few_covariance(information / dispersion + prior, scores, prior)))
+    place = {p.name: int(k) for p, k in zip(linear.parameters, layout(linear, every)[0][0], strict=True)}
+    return {
+        active.effect.name: {
+            p.name: (float(active.values[p.name][0]), float(std[place[f"{active.effect.name}.{p.name}"]]))
+            for p in active.effect.parameters
+        }
+        for active in world.effects
+        if active.effect.name in names
+    }
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """Whether an effect repeats from episode to episode beyond their scatter."""
+
+    scatter: float
+    """Factor by which variances between episodes exceed those of the noise; at least 1."""
+    p_value: float
+    """Probability of a larger statistic without the effect, with that scatter."""
+    without_best: float
+    """The same without the episode that speaks most for it; 1 where it is the only one."""
+
+
+def repetition(linear: Linearization, columns: Sequence[int], dispersion: float) -> Repetition:
+    """Test an effect beside the scatter of its parameters between episodes.
+
+    Args:
+        linear: Linearization of the segments with the effect.
+        columns: Columns of the effect's parameters.
+        dispersion: Factor by which variances exceed those of the noise.
+    """
+    scatter, p_value = _beside_scatter(linear, columns, dispersion)
+    episodes = [int(one) for one in np.unique(linear.episode)]
+    without = [_beside_scatter(linear.without_episode(one), columns, dispersion)[1] for one in episodes]
+    return Repetition(scatter, p_value, max(without) if len(episodes) > 1 else 1.0)
+
+
+def _beside_scatter(linear: Linearization, columns: Sequence[int], dispersion: float) -> tuple[float, float]:
+    """Return the scatter between episodes, and the p-value of an effect beside it."""
+    chosen = [*range(linear.base), *columns]
+    width = widths(linear, columns)
+    count = len(widths(linear, chosen)) - len(width)
+    information, score = sums(linear, chosen)
+    fitted = solved(information, score, widths(linear, chosen))[0]
+    kept = replace(linear, prior=np.zeros_like(linear.prior))
+    statistic, rank, total, slope = 0.0, 0, np.zeros((len(width), len(width))), np.zeros(len(width))
+    for episode in np.unique(linear.episode):
+        mine, own = sums(kept.only_episode(int(episode)), chosen)
+        # beside the parameters of the model, where they are fitted jointly
+        left, matrix = own[count:] - mine[count:, :count] @ fitted[:count], mine[count:, count:]
+        total, slope = total + matrix, slope + left
+        explained, size = solved(matrix, left, width)[2:]
+        statistic, rank = statistic + explained, rank + size
+    common, size = solved(total, slope, width)[2:]
+    q, dof = max(statistic - common, 0.0) / dispersion, max(rank - size, 0)
+    scatter = max(1.0, (LIMITS.model_counts + q) / (LIMITS.model_counts + dof))
+    test = score_test(linear, columns, dispersion=dispersion)
+    if not test.dof or not test.admissible:
+        return scatter, 1.0
+    tail = f_tail(test.statistic / test.dof / scatter, test.dof, LIMITS.model_counts + dof)
+    one_sided = test.dof == 1 and linear.parameters[columns[0]].bounds[0] == 0.0
+    return scatter, 0.5 * tail if one_sided else tail

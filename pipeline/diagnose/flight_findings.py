@@ -1,30 +1,34 @@
 """What flights show: the effects that they lack, judged beside the errors that the tracks carry, and what is left.
 
-The search runs once under the noise of short windows. What neither its effects nor all candidates together follow is
-then split into the errors of whole flights (`segments/slow_errors`), unless white noise explains what is left; where
-there are any, the search runs again under them, so that an effect counts as far as it does the same in all episodes.
+Where errors of short windows are correlated, what all candidates together do not follow is first split into the errors
+of whole flights (`segments/slow_errors`), under which the search runs, so that an effect counts as far as it does the
+same in all episodes. White noise is believed as long as it explains what is left beside the effects that it shows.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ..physics.parameters import effect_parameters
 from ..physics.world import World
 from ..segments.candidates import Candidate, admissible, variants_of
+from ..segments.linearization import linearize
 from ..segments.prepare import Prepared
 from ..segments.repeated_forces import RepeatedForce, repeated_force
 from ..segments.residual_wrench import Omnibus, ResidualWrenches, dispersion, wrench_windows
 from ..segments.segments import Segments
 from ..segments.slow_errors import SlowErrors, flight_errors
 from .alternative_laws import OtherLaw
-from .effect_selection import SelectionStep, predicts_episodes
+from .effect_selection import SelectionStep, repeats
 from .falsification import Consistency
 from .flight_omnibus import flight_windows, is_significant, worst_omnibus
-from .flight_selection import judged, selected
+from .flight_search import flight_search
+from .flight_selection import FlightSelection, completed, judged
 from .own_tilt import TILTS, own_tilts
 from .thresholds import THRESHOLDS
 
@@ -93,9 +97,9 @@ class FlightFindings:
 
     @property
     def predicts(self) -> bool:
-        """Whether each selected effect predicts more than one held-out episode; False without any."""
-        chosen = [step.best for step in self.steps if step.flagged]
-        return bool(chosen) and all(predicts_episodes(one) for one in chosen)
+        """Whether each selected effect repeats from episode to episode; False without any."""
+        chosen = [step for step in self.steps if step.flagged]
+        return bool(chosen) and all(repeats(one.best, len(one.evidence)) for one in chosen)
 
     @property
     def differs(self) -> bool:
@@ -126,95 +130,159 @@ def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candi
         world: The model's world.
         candidates: All candidates.
     """
-    found = _searched(prepared, prepared, world, candidates, None)
-    if not (prepared.noise_model.correlated or found.remains or found.doubtful):
-        return found
-    errors, law = _told_errors(prepared, found.world, candidates)
-    if errors is None:
-        return replace(found, own_law=law)
-    beside = prepared.with_slow_noise(world, errors.noise_model, flights=errors.flights)
-    found = _searched(beside, prepared, world, candidates, errors, law)
-    by_group = [p.name.partition(".")[0] for p in effect_parameters(found.world) if p.shared == "group"]
-    if not by_group or not set(by_group) - {active.effect.name for active in world.effects}:
+    search = _Search(prepared, world, candidates)
+    errors, law = search.errors(world) if prepared.noise_model.correlated else None, None
+    beside = search.beside(errors)
+    chosen = search.selection(beside)
+    if errors is not None:
+        errors, law, beside, chosen = search.settled(errors, beside, chosen)
+    found = search.findings(beside, chosen, errors, law)
+    if errors is None and not prepared.noise_model.correlated and (found.remains or found.doubtful):
+        errors, law = search.told(found.world, search.errors(found.world))
+        if errors is None:
+            return replace(found, own_law=law)
+        beside = search.beside(errors)
+        found = search.findings(beside, search.selection(beside), errors, law)
+    by_group = {p.name.partition(".")[0] for p in effect_parameters(found.world) if p.shared == "group"}
+    if not by_group - {active.effect.name for active in world.effects}:
         return found
     # what groups have of their own counted as slow errors of the tracks, and hid which effect it is
-    errors, own_law = _told_errors(
-        prepared.with_own(found.world), found.world, candidates, not set(by_group) & set(TILTS)
-    )
+    own = replace(search, prepared=prepared.with_own(found.world))
+    errors, law = own.told(found.world, own.errors(found.world), tilted=not by_group & set(TILTS))
     if errors is None or not errors.noise_model.slow:
         return found
-    beside = prepared.with_slow_noise(world, errors.noise_model, flights=errors.flights)
-    return _searched(beside, prepared, world, candidates, errors, own_law)
+    beside = search.beside(errors)
+    return search.findings(beside, search.selection(beside), errors, law)
 
 
-def _told_errors(
-    prepared: Prepared, world: World, candidates: Sequence[Candidate], tilted: bool = True
-) -> tuple[SlowErrors | None, str | None]:
-    """Return the errors of flights beside the effects of a world, and what accelerations follow that are no tilts.
+class _Beside(NamedTuple):
+    """Episodes under one noise."""
 
-    Args:
-        prepared: The episodes.
-        world: The world with the effects found so far.
-        candidates: All candidates.
-        tilted: Whether episodes may have a tilt of their own; not where their groups have one.
-    """
-    kept, _ = admissible(world, candidates, prepared.has_orientation)
-    slow = flight_errors(prepared, world, variants_of(kept, world.gravity[0, :1]))
-    if slow is None or not slow.sway_evidence:
-        return slow, None
-    if not tilted:
-        return slow.tiltless(), None
-    own = own_tilts(prepared, world, candidates, slow)
-    if own.kind == "tilts":
-        return slow, own.law
-    # what is not named as a tilt counts as an error all the same, unless it is a force, which nothing may hide
-    return (slow.tiltless() if own.kind == "force" else replace(slow, sway_evidence=0.0)), own.law
+    prepared: Prepared
+    """The episodes, with errors of whole flights as part of their noise where there are any."""
+    windows: list[tuple[Segments, ResidualWrenches]]
+    """Windows of their flights with residual wrenches, by length."""
+
+    @property
+    def scatter(self) -> float:
+        """Factor by which variances exceed those of the noise."""
+        return max(self.prepared.slow, dispersion(*self.windows[-1])) if self.windows else 1.0
 
 
-def _searched(
-    prepared: Prepared,
-    quick: Prepared,
-    world: World,
-    candidates: Sequence[Candidate],
-    errors: SlowErrors | None,
-    own_law: str | None = None,
-) -> FlightFindings:
-    """Return the findings under the noise of prepared episodes.
+@dataclass(frozen=True)
+class _Search:
+    """What each step of the search in flight needs."""
 
-    Args:
-        prepared: The episodes, with slow errors as part of their noise where there are any.
-        quick: The same without them: what repeats is looked for in short windows, whose errors differ from episode to
-            episode whatever their law.
-        world: The model's world.
-        candidates: All candidates.
-        errors: The errors of whole flights; None for those of short windows.
-        own_law: What accelerations that differ from episode to episode follow.
-    """
-    slow = errors if errors is not None and errors.noise_model.slow else None
-    windows = flight_windows(prepared, world)
-    scatter = max(prepared.slow, dispersion(*windows[-1])) if windows else 1.0
-    before = worst_omnibus(windows, scatter)
-    found = selected(prepared, world, candidates, scatter, errors)
-    prepared, quick = prepared.with_own(found.world), quick.with_own(found.world)
-    tested = judged(prepared, found, scatter, slow, own_law is not None)
-    found, changed = tested.selection, tested.selection.world is not world
-    left, share = _left(quick, world, found.world, changed)
-    return FlightFindings(
-        prepared=prepared,
-        slow=slow,
-        scatter=scatter,
-        steps=tuple(found.steps),
-        world=found.world,
-        segments=found.flight,
-        before=before,
-        after=worst_omnibus(flight_windows(prepared, found.world), scatter) if changed else before,
-        agreement=tested.agreement,
-        fleeting=tuple(sorted(tested.fleeting & set(found.names))),
-        others=tuple(one for one in tested.others if one.effect in found.names),
-        left=left,
-        common_share=share,
-        own_law=own_law,
-    )
+    prepared: Prepared
+    """The episodes, without errors of whole flights as part of their noise."""
+    world: World
+    """The model's world."""
+    candidates: Sequence[Candidate]
+    """All candidates."""
+
+    def errors(self, world: World) -> SlowErrors | None:
+        """Return the errors of whole flights beside the effects of a world and all candidates; None for known ones."""
+        kept, _ = admissible(world, self.candidates, self.prepared.has_orientation)
+        return flight_errors(self.prepared, world, variants_of(kept, world.gravity[0, :1]))
+
+    def beside(self, errors: SlowErrors | None) -> _Beside:
+        """Return the episodes with errors as part of their noise."""
+        prepared = self.prepared
+        if errors is not None:
+            prepared = prepared.with_slow_noise(self.world, errors.noise_model, flights=errors.flights)
+        return _Beside(prepared, flight_windows(prepared, self.world))
+
+    def selection(self, beside: _Beside) -> FlightSelection:
+        """Return the effects with one value for all episodes that flights ask for."""
+        return FlightSelection(*flight_search(beside.prepared, self.world, self.candidates, beside.scatter))
+
+    def settled(
+        self, errors: SlowErrors, beside: _Beside, chosen: FlightSelection
+    ) -> tuple[SlowErrors | None, str | None, _Beside, FlightSelection]:
+        """Return errors, what accelerations follow, episodes and effects, searched again where the errors are others.
+
+        Errors are estimated beside all candidates, but each of them as small: what is not linear in a large effect
+        counts as an error until this effect is found.
+        """
+        told, law = self.told(chosen.world, self.errors(chosen.world) if chosen.names else errors)
+        swayless = told is None or bool(errors.noise_model.position.sway and not told.noise_model.position.sway)
+        if told is None or swayless or _differ(chosen, told):
+            beside = self.beside(told)
+            return told, law, beside, self.selection(beside)
+        return replace(told, noise_model=errors.noise_model), law, beside, chosen
+
+    def told(
+        self, world: World, errors: SlowErrors | None, tilted: bool = True
+    ) -> tuple[SlowErrors | None, str | None]:
+        """Return errors without what nothing may hide, and what accelerations follow that are no tilts.
+
+        Args:
+            world: The world with the effects found so far.
+            errors: The errors beside these.
+            tilted: Whether episodes may have a tilt of their own; not where their groups have one.
+        """
+        if errors is None or not errors.sway_evidence:
+            return errors, None
+        if not tilted:
+            return errors.tiltless(), None
+        own = own_tilts(self.prepared, world, self.candidates, errors)
+        if own.kind == "tilts":
+            return errors, own.law
+        # what is not named as a tilt counts as an error all the same, unless it is a force
+        return (errors.tiltless() if own.kind == "force" else replace(errors, sway_evidence=0.0)), own.law
+
+    def findings(
+        self, beside: _Beside, chosen: FlightSelection, errors: SlowErrors | None, own_law: str | None
+    ) -> FlightFindings:
+        """Return the findings of a selection.
+
+        What repeats is looked for in short windows, whose errors differ from episode to episode whatever their law.
+
+        Args:
+            beside: The episodes, with the errors as part of their noise.
+            chosen: The effects with one value for all episodes.
+            errors: The errors of whole flights; None for those of short windows.
+            own_law: What accelerations that differ from episode to episode follow.
+        """
+        slow = errors if errors is not None and errors.noise_model.slow else None
+        scatter, before = beside.scatter, worst_omnibus(beside.windows, beside.scatter)
+        found = completed(beside.prepared, chosen, self.candidates, scatter, errors)
+        prepared, quick = beside.prepared.with_own(found.world), self.prepared.with_own(found.world)
+        tested = judged(prepared, found, scatter, slow, own_law is not None)
+        found, changed = (
+            tested.selection.with_scatter(prepared.groups, scatter),
+            tested.selection.world is not self.world,
+        )
+        left, share = _left(quick, self.world, found.world, changed)
+        return FlightFindings(
+            prepared=prepared,
+            slow=slow,
+            scatter=scatter,
+            steps=tuple(found.steps),
+            world=found.world,
+            segments=found.flight,
+            before=before,
+            after=worst_omnibus(flight_windows(prepared, found.world), scatter) if changed else before,
+            agreement=tested.agreement,
+            fleeting=tuple(sorted(tested.fleeting & set(found.names))),
+            others=tuple(one for one in tested.others if one.effect in found.names),
+            left=left,
+            common_share=share,
+            own_law=own_law,
+        )
+
+
+def _differ(chosen: FlightSelection, errors: SlowErrors) -> bool:
+    """Return whether errors change the standard error of a selected effect by more than `LIMITS.same_error`."""
+    if chosen.flight is None or not chosen.names:
+        return False
+    stds = []
+    for flight in (chosen.flight, replace(chosen.flight, noise_model=errors.noise_model)):
+        linear = linearize(flight, chosen.world, (), [0] * (1 + max(i.episode for i in flight.items)), robust=False)
+        information = (linear.information * linear.weight[:, None, None]).sum(0) + np.diag(linear.prior)
+        own = [k for k, p in enumerate(linear.parameters) if p.name.partition(".")[0] in chosen.names]
+        stds.append(np.sqrt(np.diag(np.linalg.inv(information))[own]))
+    return bool((np.abs(np.log(stds[1] / stds[0])) > math.log(LIMITS.same_error)).any())
 
 
 def _left(prepared: Prepared, world: World, after_flight: World, selected: bool) -> tuple[RepeatedForce | None, float]:

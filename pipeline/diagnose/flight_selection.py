@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from ..physics.world import World
@@ -16,9 +16,9 @@ from .alternative_laws import OtherLaw, other_laws
 from .coupled_effects import DRAGS
 from .cross_validation import held_out_loss
 from .effect_selection import SelectionStep
-from .falsification import Consistency, consistency
+from .falsification import Consistency, consistency, fitted_numbers
 from .flight_omnibus import flight_windows, is_significant, worst_omnibus
-from .flight_search import flight_search, reselected
+from .flight_search import reselected
 from .group_values import with_group_values
 from .lasting_forces import without_lasting
 from .own_tilt import TILTS, own_tilt_step
@@ -42,6 +42,13 @@ class FlightSelection(NamedTuple):
         """Names of the selected effects with one value for all episodes."""
         return [step.best.name for step in self.steps if step.flagged and step.own_std is None]
 
+    def with_scatter(self, groups: Sequence[int], scatter: float) -> FlightSelection:
+        """Give the numbers of the effects standard errors that hold the scatter between episodes."""
+        if self.flight is None or not self.names:
+            return self
+        numbers = fitted_numbers(self.flight, self.world, self.names, groups, scatter)
+        return self._replace(steps=[_with_numbers(step, numbers) for step in self.steps])
+
     def without(self, names: set[str]) -> FlightSelection:
         """Leave out some effects, and fit the others again."""
         if self.flight is None:
@@ -64,11 +71,21 @@ class JudgedSelection:
     """Whether the effects have the same parameters in all episodes; None without effects."""
 
 
-def selected(
-    prepared: Prepared, world: World, candidates: Sequence[Candidate], scatter: float, errors: SlowErrors | None
+def _with_numbers(step: SelectionStep, numbers: Mapping[str, Mapping[str, tuple[float, float]]]) -> SelectionStep:
+    """Return a step with other numbers of its effect, where there are any."""
+    if step.best.name not in numbers or step.own_std is not None:
+        return step
+    return replace(step, equals=(replace(step.best, numbers=dict(numbers[step.best.name])), *step.equals[1:]))
+
+
+def completed(
+    prepared: Prepared,
+    found: FlightSelection,
+    candidates: Sequence[Candidate],
+    scatter: float,
+    errors: SlowErrors | None,
 ) -> FlightSelection:
-    """Select effects with one value for all episodes; beside slow errors also with one for each episode or group."""
-    found = FlightSelection(*flight_search(prepared, world, candidates, scatter))
+    """Return the needed effects of a search; beside slow errors also those with a value for each episode or group."""
     if found.flight is None or errors is None:
         return found
     if errors.noise_model.slow:

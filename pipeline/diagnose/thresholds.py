@@ -73,17 +73,15 @@ class FlightThresholds:
     paired_t: float = threshold(
         3.0,
         "standard errors",
-        "beside correlated errors a rival is ruled out where it is worse by this much in the mean over episodes",
+        "beside correlated errors a rival is ruled out where it is worse by this much in the mean over episodes, or by "
+        "its square in chi2 beside the scatter between episodes",
         "by argument: with 12 episodes 0.6 % of rivals that are as good lie farther off",
     )
-    repeated_gain: float = threshold(
-        12.0,
-        "chi2",
-        "beside correlated errors, held-out episodes have to gain this without the one that gains most: odds of 400; "
-        "where more than the noise is left, effects that do are named all the same",
-        BY_ARGUMENT,
-        "real-like development, even seeds: a magnet from smeared edges of contacts gained 4; true small ones, at the "
-        "noise of whole flights, 6 or more; report2: at 6 a tilt in 1 of 22 nulls, at 12 not, and 7 of 7 right names",
+    without_best: float = threshold(
+        0.01,
+        "probability",
+        "beside correlated errors, largest p-value of an effect without the episode that speaks most for it",
+        "by argument: one episode shows a burst, the smeared edge of a contact or a hand as well",
     )
     measured: float = threshold(
         0.04,
@@ -126,6 +124,12 @@ class VerdictThresholds:
         "1",
         "beside correlated errors, one of several effects is left out if the loss of held-out flights rises by less",
         "by argument, as in `improve`; looked at on one recording of throws, it takes away the second of two drags",
+    )
+    same_error: float = threshold(
+        1.25,
+        "1",
+        "factor of a standard error from which flights are searched again, under the errors beside the effects found",
+        BY_ARGUMENT,
     )
     common_share: float = threshold(
         0.6,
@@ -184,6 +188,16 @@ class VerdictThresholds:
         "probability",
         "an effect whose parameters differ between groups or episodes (p below it, shared part below "
         "`consistent_share`) imitates another one: `unexplained`",
+    )
+    model_counts: float = threshold(
+        4.0,
+        "episodes",
+        "degrees of freedom for which the noise model counts in the scatter of an effect between episodes, beside "
+        "correlated errors",
+        "real-like development, half of the captures, of 2, 4, 6 and 8: the largest without a wrong name in 35 nulls",
+        "the other half, first step alone: 0 of 24 nulls, 9 of 27 effects of flight and measurement, all of the right "
+        "class",
+        (0, 24),
     )
     consistent_share: float = threshold(0.9, "1", "see `consistent_p`", error_rates="see `consistent_p`")
     better_chi2: float = threshold(

@@ -76,7 +76,7 @@ WHITE = NoiseModel()
 """Uncorrelated noise."""
 
 
-def matern(gaps_s: Tensor, time_s: float | Tensor, order: float) -> Tensor:
+def matern(gaps_s: Tensor, time_s: float, order: float) -> Tensor:
     """Return the correlation over gaps [s] of a process of an order, by Rasmussen & Williams (2006), eq. 4.16 f.
 
     Args:
@@ -89,6 +89,14 @@ def matern(gaps_s: Tensor, time_s: float | Tensor, order: float) -> Tensor:
         return torch.exp(-x)
     x = x.clamp_max(700.0)  # where the exponential is not yet 0
     return (1 + x + (x.square() / 3 if order > 2 else 0.0)) * torch.exp(-x)
+
+
+def matern_by_time(gaps_s: Tensor, time_s: float, order: float) -> Tensor:
+    """Return the derivative of :func:`matern` by the logarithm of its time; arguments as there."""
+    x = (gaps_s * (FALLS[order] / time_s)).clamp_max(700.0)
+    if order == 0.5:
+        return x * torch.exp(-x)
+    return x.square() * ((1 + x) / 3 if order > 2 else 1.0) * torch.exp(-x)
 
 
 def innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNoise) -> Tensor:

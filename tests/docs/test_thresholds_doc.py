@@ -100,6 +100,8 @@ SEGMENT_NUMERICS = {
         "sliding_descent.ITERATIONS, MAX_DAMPING, FALL, FALL_SHARE",
         "sliding_residuals.SWEEPS",
         "variance_components.STEPS",
+        "variance_components.LONGEST, ENOUGH",
+        "variance_components.LEAST_INFORMATION",
     ),
     "start of a descent, or lengths of a step that are tried": (
         "impact_fit.SHARES",
@@ -143,7 +145,7 @@ SEGMENT_NUMERICS = {
         "residual_wrench.WEAK_STD",
         "flight_contrasts.KEPT",
         "flight_contrasts.LEAST_MOVE",
-        "flight_contrasts.LEAST_WHITE",
+        "restricted_likelihood.LEAST_WHITE",
         "variance_components.LEAST_STD",
         "segment_fit.LEAST_WEIGHT",
         "sliding_descent.WEAK",

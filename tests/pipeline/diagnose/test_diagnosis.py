@@ -4,25 +4,28 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.capture import Capture
-from cgwm.pipeline.diagnose import diagnose, flight_search, stage
-from cgwm.pipeline.diagnose.effect_selection import SelectionStep, is_slight, predicts_episodes, select_next
+from cgwm.pipeline.diagnose import diagnose, falsification, flight_search, stage
+from cgwm.pipeline.diagnose.effect_selection import SelectionStep, is_slight, repeats, select_next
 from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.falsification import consistency
+from cgwm.pipeline.diagnose.falsification import consistency, fitted_numbers, repetition
 from cgwm.pipeline.diagnose.flight_equals import fitted_contact, resolved_flight, separated
 from cgwm.pipeline.diagnose.score_test import ScoreTest, score_test
 from cgwm.pipeline.diagnose.sparse_regression import residual_law
+from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
+from cgwm.pipeline.optimization.uncertainty import student_quantile, student_tail
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.effects.gravity_tilt import GravityTilt
 from cgwm.pipeline.physics.effects.registry import BUILT_IN
+from cgwm.pipeline.physics.parameters import Parameter
 from cgwm.pipeline.segments.candidates import Candidate, variants_of
 from cgwm.pipeline.segments.contact_phases import phases_of
-from cgwm.pipeline.segments.linearization import linearize
+from cgwm.pipeline.segments.linearization import Linearization, linearize
 from cgwm.pipeline.segments.prepare import Prepared, prepare
 from cgwm.pipeline.segments.residual_wrench import covariates_of, omnibus, residual_wrenches, wrench_windows
 from cgwm.pipeline.segments.segment_states import fit_states
@@ -400,12 +403,58 @@ def test_what_is_small_needs_more_evidence(size: float, delta_bic: float | None,
     assert is_slight(found) == slight
 
 
-def test_beside_correlated_errors_what_is_named_shows_in_more_than_one_episode() -> None:
-    test = ScoreTest(statistic=30.0, dof=1, p_value=1e-5, estimate=np.zeros(1), covariance=np.eye(1), admissible=True)
-    found = Evidence(candidate=Candidate("buoyancy", load_effect("buoyancy")), constants={}, test=test, p_value=1e-5)
-    assert predicts_episodes(replace(found, gains=(18.0, 10.0, -3.0, 6.0)))
-    assert not predicts_episodes(replace(found, gains=(18.0, 3.0, 1.0, 0.0)))
-    assert not predicts_episodes(replace(found, gains=(80.0, 20.0, -16.0, 0.0)))
+def one_parameter(information: np.ndarray, scores: np.ndarray) -> Linearization:
+    """Information on a scale of gravity, and scores, of episodes with one segment each."""
+    count = len(scores)
+    parameter = Parameter(
+        name="gravity_scale.s", unit="1", bounds=(-9.0, 9.0), logarithmic=False, reveals="", prior=(0.0, 1.0)
+    )
+    return Linearization(
+        parameters=(parameter,), base=0, information=information[:, None, None], score=scores[:, None],
+        weight=np.ones(count), episode=np.arange(count), group=np.zeros(count, np.int64), prior=np.zeros(1),
+        chi2=np.zeros(count), dof=np.ones(count),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("scores", "wider"), [((5.0, -5.0, 4.0, -4.0, 0.0), True), ((0.1, -0.1, 0.0, 0.0, 0.0), False)]
+)
+def test_standard_errors_hold_the_scatter_between_episodes(
+    scores: tuple[float, ...], wider: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    linear = one_parameter(np.full(5, 5.0), np.array(scores))
+    monkeypatch.setattr(falsification, "linearize", lambda *_, **__: linear)
+    world = world_with("ball", {"gravity_scale": {"s": 0.01}}, False)
+    value, std = fitted_numbers(cast(Segments, None), world, ["gravity_scale"], [0] * 5, 1.0)["gravity_scale"]["s"]
+    # Huber's sandwich over five episodes, with Student's t of four degrees of freedom; at least that of the noise
+    sandwich = np.sqrt(5 / 4 * np.square(scores).sum()) / 25 * student_quantile(0.975, 4) / 1.96
+    assert value == pytest.approx(0.01)
+    assert std == pytest.approx(max(sandwich, 1 / 5)) and (std > 0.201) == wider
+
+
+@pytest.mark.parametrize(
+    ("information", "scores", "named"),
+    [
+        ((5.0, 5.0, 5.0, 5.0, 5.0), (6.0, 6.0, 6.0, 6.0, 6.0), True),
+        ((5.0, 5.0, 5.0, 5.0, 5.0), (30.0, 0.0, 0.0, 0.0, 0.0), False),
+        ((5.0, 5.0, 5.0, 5.0, 5.0), (24.0, 28.0, -12.0, -10.0, 0.0), False),
+        ((96.0, 1.0, 1.0, 1.0, 1.0), (60.0, 0.0, 0.0, 0.0, 0.0), False),
+    ],
+)
+def test_what_is_named_shows_beside_the_scatter_of_episodes(
+    information: tuple[float, ...], scores: tuple[float, ...], named: bool
+) -> None:
+    """The statistic is 36 and more; in the last case it is that of one episode, from which no other differs."""
+    m, g, d = np.array(information), np.array(scores), THRESHOLDS.verdict.model_counts
+    found = repetition(one_parameter(m, g), [0], 1.0)
+    q = float((g**2 / m).sum() - g.sum() ** 2 / m.sum())
+    assert found.scatter == pytest.approx(max(1.0, (d + q) / (d + 4)))
+    t = g.sum() / np.sqrt(m.sum() * found.scatter)
+    assert found.p_value == pytest.approx(2 * student_tail(t, d + 4), rel=1e-6)
+    candidate = Candidate("gravity_scale", load_effect("gravity_scale"))
+    test = ScoreTest(statistic=36.0, dof=1, p_value=1e-9, estimate=np.zeros(1), covariance=np.eye(1), admissible=True)
+    evidence = Evidence(candidate=candidate, constants={}, test=test, p_value=1e-9, repetition=found)
+    assert repeats(evidence, 5) == named
 
 
 def test_steps_in_flight_are_short_enough_for_fine_measurements() -> None:

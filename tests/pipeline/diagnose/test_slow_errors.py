@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.diagnose import flight_selection
+from cgwm.pipeline.diagnose import flight_findings, flight_selection
 from cgwm.pipeline.diagnose.effect_selection import _with_unproven, select_next
 from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.flight_findings import _searched
+from cgwm.pipeline.diagnose.flight_findings import _Search
 from cgwm.pipeline.diagnose.flight_selection import FlightSelection
 from cgwm.pipeline.diagnose.own_accelerations import OwnAccelerations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.pictures import effect_picture
@@ -144,14 +144,16 @@ def test_rivals_in_the_presence_of_an_effect_that_has_gone_are_none(monkeypatch:
     def the_last(found: FlightSelection) -> FlightSelection:
         return found.without({"quadratic_drag"})
 
-    monkeypatch.setattr(flight_selection, "flight_search", both)
+    monkeypatch.setattr(flight_findings, "flight_search", both)
     monkeypatch.setattr(flight_selection, "_with_the_needed", the_last)
     flying = tosses(world_with("ball", {"linear_drag": {"c": 0.3}}, False), 2, count=4, duration_s=0.6)
     world = world_with("ball", ground=False)
     errors = NoiseModel(position=CorrelatedNoise(share=0.5, time_s=0.02, slow=1.0, slow_time_s=0.2))
     prepared = prepare(world, flying).with_slow_noise(world, errors)
     slow = SlowErrors(errors, errors, evidence=100.0, sway_evidence=0.0, flights=())
-    left = _searched(prepared, prepared, world, LIBRARY, slow)
+    search = _Search(prepared, world, LIBRARY)
+    beside = search.beside(None)
+    left = search.findings(beside, search.selection(beside), slow, None)
     assert [[one.name for one in step.equals] for step in left.steps] == [["linear_drag"]]
     remaining = remaining_of(left)
     # with the drag: the noise of three coordinates; without it, centimetres
@@ -164,7 +166,7 @@ def test_of_rivals_the_one_that_acts_alone_comes_first() -> None:
     def rival(name: str, bic: float) -> Evidence:
         refitted = SimpleNamespace(by_segment=[torch.tensor([1.0, 2.0, 3.0])])
         return cast(Evidence, SimpleNamespace(candidate=Candidate(name, load_effect(name)), name=name,
-                                              refitted=refitted, delta_bic=bic))  # fmt: skip
+                                              refitted=refitted, delta_bic=bic, repetition=None))  # fmt: skip
 
     wind, tilt = rival("wind", -2.0), rival("gravity_tilt", -1.0)
     assert _with_unproven([wind], [wind, tilt], np.arange(3)) == [tilt, wind]

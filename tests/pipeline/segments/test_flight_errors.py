@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cgwm.pipeline.segments.flight_contrasts import Components, FlightContrasts, _spanned, _spread_frames  # pyright: ignore[reportMissingImports]
-from cgwm.pipeline.segments.variance_components import _climbed  # pyright: ignore[reportMissingImports]
+from cgwm.pipeline.segments.flight_contrasts import FlightContrasts, _spanned, _spread_frames
+from cgwm.pipeline.segments.restricted_likelihood import Components, RestrictedLikelihood
+from cgwm.pipeline.segments.variance_components import _climbed
 from cgwm.pipeline.trajectories.correlated_noise import _likelihood, _Windows
 from cgwm.pipeline.trajectories.innovations import FALLS, CorrelatedNoise, matern
 from scipy.signal import butter, filtfilt
@@ -49,36 +50,47 @@ def slow_power(noise: CorrelatedNoise) -> float:
     return noise.size**2 * (noise.share * alike + 1 - noise.share)
 
 
-def test_the_likelihood_of_flights_is_that_of_a_dense_covariance() -> None:
+def dense_covariance(one: FlightContrasts, counts: tuple[int, ...], sizes: Components) -> torch.Tensor:
+    """The covariance of all residuals, written out."""
+    blocks = []
+    for times, count in zip(one.times_s, counts, strict=True):
+        t = times[:count]
+        gap, path = (t[:, None] - t).abs(), 0.5 * (t - t[0]).square()
+        plain = sizes.fast * matern(gap, sizes.time_s, sizes.order) + (sizes.white + 1e-6) * torch.eye(count, dtype=F64)
+        plain = plain + (sizes.slow or 0.0) * torch.exp(-gap / sizes.slow_time_s)
+        blocks += [plain + ((sizes.sway or 0.0) * path[:, None] * path if axis < 2 else 0) for axis in range(3)]
+    return torch.block_diag(*blocks)
+
+
+@pytest.mark.parametrize("order", FALLS)
+def test_likelihood_slope_and_information_are_those_of_a_dense_covariance(order: float) -> None:
     rng = np.random.default_rng(3)
-    common = torch.as_tensor(rng.standard_normal((2, 9, 3, 2)))
-    one = contrasts_of(rng.standard_normal((2, 9, 3)), common)
+    one, counts = (
+        contrasts_of(rng.standard_normal((2, 9, 3)), torch.as_tensor(rng.standard_normal((2, 9, 3, 2)))),
+        (9, 7),
+    )
     one.mask[1, 7:] = 0
     for values in (one.rows, one.own, one.common):
         values[1, 7:] = 0
-    values = [torch.tensor(v, dtype=F64) for v in (0.3, 0.8, 0.02, 2.0, 0.3, 900.0)]
-    for order in FALLS:
-        white, fast, time_s, slow, slow_time_s, sway = values
-        sizes = Components(white, fast, time_s, order, slow, slow_time_s, sway)
-        blocks, design, y = [], [], []
-        for k, count in enumerate((9, 7)):
-            t = one.times_s[k, :count]
-            gap, path = (t[:, None] - t).abs(), 0.5 * (t - t[0]).square()
-            plain = fast * matern(gap, 0.02, order) + slow * torch.exp(-gap / 0.3) + (white + 1e-6) * torch.eye(count)
-            for axis in range(3):
-                blocks.append(plain + (sway * path[:, None] * path if axis < 2 else 0))
-                zeros = [torch.zeros(count, 6, dtype=F64) for _ in range(2)]
-                zeros[k] = one.own[k, :count, axis]
-                design.append(torch.cat((*zeros, one.common[k, :count, axis]), 1))
-                y.append(one.rows[k, :count, axis])
-        root = torch.linalg.cholesky(torch.block_diag(*blocks))
-        x, left = (
-            torch.linalg.solve_triangular(root, v, upper=False) for v in (torch.cat(design), torch.cat(y)[:, None])
-        )
-        normal = x.mT @ x
-        square = left.square().sum() - (x.mT @ left).mT @ torch.linalg.solve(normal, x.mT @ left)
-        dense = -0.5 * (2 * root.diagonal().log().sum() + torch.linalg.slogdet(normal)[1] + square)
-        torch.testing.assert_close(one.likelihood(sizes, (0, 1)), dense[0, 0], rtol=1e-6, atol=1e-6)
+    kinds, z = ("slow", "sway"), np.array([-0.6, 0.1, np.log(0.02), 0.3, np.log(0.3), 3.4])
+    x, y = torch.zeros(48, 14, dtype=F64), torch.cat([one.rows[k, :n].mT.flatten() for k, n in enumerate(counts)])
+    for k, n in enumerate(counts):
+        own = torch.cat((one.own[k, :n], one.common[k, :n]), -1).transpose(0, 1).flatten(0, 1)
+        x[27 * k : 27 * k + 3 * n, [*range(6 * k, 6 * k + 6), 12, 13]] = own
+    covariance = dense_covariance(one, counts, Components.of(z, kinds, order))
+    moved = [Components.of(z + 1e-5 * np.eye(6)[k] * sign, kinds, order) for k in range(6) for sign in (1, -1)]
+    slopes = [dense_covariance(one, counts, sizes) for sizes in moved]
+    by_coordinate = [(a - b) / 2e-5 for a, b in zip(slopes[::2], slopes[1::2], strict=True)]
+    inverse = torch.linalg.inv(covariance)
+    normal = x.mT @ inverse @ x
+    left = inverse - inverse @ x @ torch.linalg.solve(normal, x.mT @ inverse)
+    value = -0.5 * (torch.logdet(covariance) + torch.logdet(normal) + y @ left @ y)
+    slope = [0.5 * (y @ left @ v @ left @ y - (left * v).sum()) for v in by_coordinate]
+    information = [[0.5 * y @ left @ a @ left @ b @ left @ y for a in by_coordinate] for b in by_coordinate]
+    found = RestrictedLikelihood(one, (0, 1)).at(Components.of(z, kinds, order))
+    assert found.value == pytest.approx(float(value), rel=1e-6, abs=1e-6)
+    np.testing.assert_allclose(found.slope, slope, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found.information, information, rtol=1e-5, atol=1e-5)
 
 
 def test_the_likelihood_of_windows_is_that_of_their_contrasts() -> None:
@@ -99,7 +111,8 @@ def test_the_likelihood_of_windows_is_that_of_their_contrasts() -> None:
 
 def likeliest(contrasts: FlightContrasts) -> CorrelatedNoise:
     start = [(-1.0, 0.0, np.log(0.02))]
-    return max((_climbed(contrasts, start, (), (0, 1), order) for order in FALLS), key=lambda one: one[1])[0]
+    every = RestrictedLikelihood(contrasts, (0, 1))
+    return max((_climbed(every, start, (), order) for order in FALLS), key=lambda one: one[1])[0]
 
 
 @pytest.mark.parametrize("order", FALLS)

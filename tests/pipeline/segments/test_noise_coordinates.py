@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
-from cgwm.pipeline.segments.flight_contrasts import LEAST_WHITE, Components
 from cgwm.pipeline.segments.repeated_forces import RepeatedForce
+from cgwm.pipeline.segments.restricted_likelihood import LEAST_WHITE, Components
 from cgwm.pipeline.segments.variance_components import _coded  # pyright: ignore[reportPrivateUsage]
 from cgwm.pipeline.trajectories.innovations import CorrelatedNoise
 
@@ -14,7 +13,7 @@ def test_coordinates_of_noise_give_it_back(share: float) -> None:
     """But for the white noise that every process has beside it, which keeps its covariance regular."""
     noise = CorrelatedNoise(share=share, time_s=0.012, size=1.1, slow=0.8, slow_time_s=0.3, sway=2.5, order=1.5)
     more = [np.log(noise.slow), np.log(noise.slow_time_s), np.log(noise.sway)]
-    found = Components.of(torch.tensor([*_coded(noise), *more]), ("slow", "sway"), noise.order).noise(noise.level)
+    found = Components.of(np.array([*_coded(noise), *more]), ("slow", "sway"), noise.order).noise(noise.level)
     for name, value in noise._asdict().items():
         assert getattr(found, name) == pytest.approx(value, rel=2 * LEAST_WHITE), name
 
