@@ -1,4 +1,4 @@
-"""The figures of `diagnose.py` that docs/results.md shows, computed from its stored cases."""
+"""The figures of `diagnose.py` that docs/results-diagnosis.md shows, computed from its stored cases."""
 
 from __future__ import annotations
 

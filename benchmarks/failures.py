@@ -3,7 +3,7 @@
 python benchmarks/failures.py MODEL CAPTURE PICTURE.png
 
 Above the frames of one camera, below what the model renders; the yellow outline is where the object really was. The
-start is estimated from the first 0.1 s, as `cgwm eval` does it. docs/results.md links two
+start is estimated from the first 0.1 s, as `cgwm eval` does it. docs/results-fits.md links two
 of these pictures, from Fall and Push on wood: the mug (episode 010) and the box (episode 006).
 """
 

@@ -1,4 +1,4 @@
-"""The figures of `missing_effects.py` that docs/results.md shows: bars are cgwm's, rivals have the same rows beside."""
+"""Figures of `missing_effects.py` in docs/results-diagnosis.md: bars are cgwm's, rivals have the same rows beside."""
 
 from __future__ import annotations
 

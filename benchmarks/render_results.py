@@ -1,13 +1,13 @@
-"""Record a figure in benchmarks/results/, or render all of them as docs/results.md (`make results`).
+"""Record a figure in benchmarks/results/, or render all of them as pages of docs/ (`make results`).
 
-    python benchmarks/render_results.py                 # writes docs/results.md
+    python benchmarks/render_results.py       # writes docs/results.md and its pages docs/results-PAGE.md
     python benchmarks/render_results.py record tests --figure "CUDA tests passed" --value "73 of 73" --target all
         --met yes --command "pytest tests/pipeline/physics/fused/test_fused.py" --machine "H100, 16 cores"
 
-Each claim is a file CLAIM.jsonl with one line for each figure; `results/claims.toml` gives their order, titles and
-explanations. A figure stays valid until it is measured again: `record` then replaces the line of the same name and
-stamps it with the commit and the date. Lines marked `transcribed` were taken once from an older journal, `measured`
-ones were written by `record`. Needs nothing but Python's standard library and git.
+Each claim is a file CLAIM.jsonl with one line for each figure; `results/claims.toml` gives their order, titles,
+explanations and pages. A figure stays valid until it is measured again: `record` then replaces the line of the same
+name and stamps it with the commit and the date. Lines marked `transcribed` were taken once from an older journal,
+`measured` ones were written by `record`. Needs nothing but Python's standard library and git.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from typing import Any
 from store import ROOT, commit_of_tree
 
 RESULTS = ROOT / "benchmarks" / "results"
-PAGE = ROOT / "docs" / "results.md"
-MOST_LINES = 200
-"""Length of the page that a reader still looks through."""
+DOCS = ROOT / "docs"
+MOST_LINES = 100
+"""Length of a page that a reader still looks through."""
 STATUSES = ("transcribed", "measured")
 _COMMIT = re.compile(r"[0-9a-f]{7,40}\+?")
 
@@ -148,32 +148,54 @@ def record(
     return new
 
 
-def render(folder: Path = RESULTS) -> str:
-    """Return the page: a summary of the most asked questions, then one table for each claim."""
+def render(folder: Path = RESULTS) -> dict[str, str]:
+    """Return the pages by file name: a summary of the most asked questions, and one page for each subject."""
     claims = read_claims(folder)
+    subjects = tomllib.loads((folder / "claims.toml").read_text(encoding="utf-8"))["page"]
     every = [one for claim in claims for one in claim["figures"]]
     counts = {met: sum(one.met is met for one in every) for met in (True, False, None)}
     lines = [
         "# Results",
         "",
         f"Of {len(every)} figures {counts[True]} meet their target, {counts[False]} miss it, {counts[None]} have no "
-        "target or leave it undecided (*open*). Written by `make results` from `benchmarks/results/*.jsonl`; a "
-        "figure stays valid until it is measured again. A date in brackets marks a figure that was transcribed from an "
-        "older journal (with the commit that entered it where the journal named none).",
+        "target or leave it undecided (*open*). The most asked ones are below; all of them, with command, commit and "
+        "machine:",
         "",
-        "| claim | figure | today | target | |",
-        "| --- | --- | --- | --- | --- |",
     ]
+    pages = {}
+    for subject in subjects:
+        own = [claim for claim in claims if claim["page"] == subject["name"]]
+        links = ", ".join(f"[{claim['title']}]({_place(claim)})" for claim in own)
+        lines.append(f"- {subject['about']} {links}.")
+        pages[f"results-{subject['name']}.md"] = _page(subject, own)
+    lines += ["", "| claim | figure | today | target | |", "| --- | --- | --- | --- | --- |"]
     for claim in claims:
         known = {one.figure: one for one in claim["figures"]}
         for one in (known[name] for name in claim.get("headline", ())):
-            title = f"[{claim['title']}](#{_anchor(claim['title'])})"
+            title = f"[{claim['title']}]({_place(claim)})"
             lines.append(_row(title, one.figure, f"**{_value(one)}**", one.target, _verdict(one)))
+    return {"results.md": "\n".join(lines) + "\n", **pages}
+
+
+def _page(subject: dict[str, Any], claims: list[dict[str, Any]]) -> str:
+    """Return the page of one subject: a table for each claim."""
+    lines = [
+        f"# {subject['title']}",
+        "",
+        f"{subject['about']} Written by `make results` from `benchmarks/results/*.jsonl`; a figure stays valid until "
+        "it is measured again. A date in brackets marks a figure that was transcribed from an older journal (with the "
+        "commit that entered it where the journal named none). The summary of all pages: [Results](results.md).",
+    ]
     for claim in claims:
-        lines += ["", f"## {claim['title']}", *([claim["about"], ""] if "about" in claim else [])]
+        lines += ["", f"## {claim['title']}", "", *([claim["about"], ""] if "about" in claim else [])]
         lines += ["| figure | value | target | | command | commit | machine |", "| --- " * 7 + "|"]
         lines += [_line(one) for one in claim["figures"]]
     return "\n".join(lines) + "\n"
+
+
+def _place(claim: dict[str, Any]) -> str:
+    """Return the link to a claim's table."""
+    return f"results-{claim['page']}.md#{_anchor(claim['title'])}"
 
 
 def _line(one: Figure) -> str:
@@ -203,7 +225,7 @@ def _anchor(title: str) -> str:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Render the page, or record one figure."""
+    """Render the pages, or record one figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     adding = parser.add_subparsers(dest="verb").add_parser("record", help="replace or add the line of one figure")
     adding.add_argument("claim")
@@ -219,11 +241,13 @@ def main(words: list[str] | None = None) -> int:
     if given.verb == "record":
         options = {key: value for key, value in vars(given).items() if key not in ("verb", "met")}
         print(json.dumps(asdict(record(**options, met=None if given.met is None else given.met == "yes"))))
-    text = render()
-    if text.count("\n") > MOST_LINES:
-        print(f"docs/results.md would have {text.count(chr(10))} lines; at most {MOST_LINES}.", file=sys.stderr)
+    pages = render()
+    long = {name: text.count("\n") for name, text in pages.items() if text.count("\n") > MOST_LINES}
+    if long:
+        print(f"at most {MOST_LINES} lines: {long}.", file=sys.stderr)
         return 1
-    PAGE.write_text(text, encoding="utf-8")
+    for name, text in pages.items():
+        (DOCS / name).write_text(text, encoding="utf-8")
     return 0
 
 

@@ -21,8 +21,8 @@ from ...trajectories.observations import Observations
 from ...trajectories.track_noise import Noise
 
 ERRORS_PER_EPISODE = 3.0
-"""Number of independent errors in one episode's open-loop error; `docs/results.md` has the resulting coverage of the
-intervals."""
+"""Number of independent errors in one episode's open-loop error; `docs/results-fits.md` has the resulting coverage of
+the intervals."""
 MAX_ROLLOUTS = 1200
 """Maximum number of rollouts in one batch of the search."""
 POPULATION = (24, 96)
