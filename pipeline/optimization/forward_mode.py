@@ -32,6 +32,7 @@ _MIXED = {
     torch.Tensor.__matmul__,
     torch.Tensor.__rmatmul__,
     torch.atan2,
+    torch.maximum,
     torch.minimum,
     torch.where,
 }
@@ -61,8 +62,8 @@ class _DenseTangents(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func in _MIXED:
-            tensors = [x for x in args if isinstance(x, Tensor) and x.is_floating_point()]
-            dual = [parts_of(x)[1] is not None for x in tensors]
+            tensors = [x for x in args if isinstance(x, Tensor)]
+            dual = [x.is_floating_point() and parts_of(x)[1] is not None for x in tensors]
             if any(dual):
                 if isinstance(args[1], float | int):
                     if func in _SCALAR_FORMS:
@@ -70,13 +71,18 @@ class _DenseTangents(TorchFunctionMode):
                     if func in _RECIPROCAL:
                         return torch.ops.aten.mul.Scalar(args[0].reciprocal(), args[1])
                 if not all(dual):
-                    args = tuple(_lifted(x) if isinstance(x, Tensor) else x for x in args)
+                    like = tensors[dual.index(True)]
+                    first = func is torch.where  # the condition stays what it is
+                    lifted = (_lifted(x, like) if isinstance(x, Tensor) else x for x in args[first:])
+                    args = (*args[:first], *lifted)
         return func(*args, **(kwargs or {}))
 
 
-def _lifted(x: Tensor) -> Tensor:
-    """Return a dual tensor with a tangent of zeros; tensors that have one, or are not floating point, unchanged."""
-    if not x.is_floating_point() or parts_of(x)[1] is not None:
+def _lifted(x: Tensor, like: Tensor) -> Tensor:
+    """Return a tensor with a tangent of zeros if it has none; truth values and integers as numbers of a given type."""
+    if not x.is_floating_point():
+        x = x.to(like.dtype)
+    elif parts_of(x)[1] is not None:
         return x
     dense = x.contiguous()  # an expanded view cannot carry a tangent
     return dual_of(dense, torch.zeros_like(dense))

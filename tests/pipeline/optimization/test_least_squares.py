@@ -82,7 +82,7 @@ def test_a_parameter_with_equal_bounds_is_not_fitted() -> None:
 
 def test_a_prior_and_a_measurement_meet_at_their_weighted_mean() -> None:
     box = Box.within(tensor([[-9.0, 9.0]]), tensor([1.0]), tensor([3.0]))
-    end = run(Curves(lambda x: 2 * x, tensor([[8.0]]), box), [[0.0]])
+    end = run(Curves(lambda x: x + x, tensor([[8.0]]), box), [[0.0]])
     assert float(end.point.values) == pytest.approx((4 * 4 + 3 * 1) / (4 + 3))
     assert float(end.information()) == pytest.approx(4 + 3)
     assert float(end.cost) == pytest.approx(4 * 3 / (4 + 3) * (4 - 1) ** 2)
