@@ -7,7 +7,8 @@ from cgwm.pipeline.optimization.least_squares import Descent, Policy, Stop, desc
 from cgwm.pipeline.optimization.levenberg_marquardt import minimise
 from cgwm.pipeline.optimization.problem import FLOOR, Box, NormalEquations, Point, Problem, Rows
 from torch import Tensor
-from torch.func import jacrev, vmap
+from torch.autograd.functional import jacobian
+from torch.func import vmap
 
 F64 = torch.float64
 TIGHT = Policy(iterations=200, relative=1e-14, absolute=1e-24)
@@ -28,7 +29,7 @@ class Curves(Problem):
 
     def linearised(self, point: Point, rows: Rows) -> NormalEquations:
         found = self.rows(point, rows)
-        slopes = vmap(jacrev(self.function))(point.values)
+        slopes = torch.stack([jacobian(self.function, one) for one in point.values])
         return NormalEquations.of_rows(found, slopes, slopes.shape[-1], found.square().sum(1))
 
 
