@@ -34,6 +34,9 @@ CAPTURE_FORMAT = "cgwm-capture/1"
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=120)]
 Pixel = Annotated[float, Field(ge=-1e6, le=1e6)]
+TRIANGLE_SLACK = 0.02
+"""Share of the sum of all moments of inertia by which one may exceed the other two: rounding. Of a thin plate, one is
+the sum of the other two."""
 
 
 def physical_inertia(value: tuple[float, ...]) -> tuple[float, ...]:
@@ -44,8 +47,7 @@ def physical_inertia(value: tuple[float, ...]) -> tuple[float, ...]:
     xx, yy, zz, xy, xz, yz = (entry / (size or 1.0) for entry in (*value, 0.0, 0.0, 0.0)[:6])
     if not _positive_definite(xx, yy, zz, (xy, xz, yz)):
         raise ValueError("the inertia must be positive definite")
-    # 2 % are left for rounded numbers: of a thin plate, one moment is the sum of the other two.
-    half = 0.51 * (xx + yy + zz)
+    half = (1 + TRIANGLE_SLACK) / 2 * (xx + yy + zz)
     if not _positive_definite(half - xx, half - yy, half - zz, (-xy, -xz, -yz)):
         raise ValueError("no body has this inertia: one moment is larger than the other two together")
     return value

@@ -28,7 +28,7 @@ from .initialization import body_seeds, to_spheres
 from .losses import body_loss, geometry_loss
 from .optimize import Rates, Trainable, descend, detached, thinned
 from .view_overlap import require_body_in_masks
-from .views import View, body_windows
+from .views import COVERED, View, body_windows
 from .visual_hull import carve
 
 
@@ -50,7 +50,7 @@ class BodyResult:
 
 def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres | None]:
     """Fit a body; return it in its body frame, and its visual spheres in the world frame if it has any."""
-    masked = [view for view in stage.train if view.cover is not None and bool((view.cover[index] > 0.5).any())]
+    masked = [view for view in stage.train if view.cover is not None and bool((view.cover[index] > COVERED).any())]
     if body.shape is None and not masked:
         raise InputDataError(
             f"{stage.capture.root}: body '{body.name}' has neither a shape nor masks.",

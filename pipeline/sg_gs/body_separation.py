@@ -18,7 +18,7 @@ from ...schemas import Body, Ground, InputDataError, PhotoBox, SplatConfig
 from ..geometry.solid_grid import Array
 from .mask_segmentation import Blob, outline
 from .object_search import LEAST_SHARE, ObjectSearch, Region
-from .views import View
+from .views import COVERED, View
 
 _POOR = 0.9
 """Agreement of the masks below which a warning asks the user to check the picture."""
@@ -121,7 +121,7 @@ def _without_masks(bodies: Sequence[Body], views: Sequence[View]) -> list[int]:
 def _wants(body: Body, index: int, views: Sequence[View]) -> bool:
     if body.shape is not None and body.photo_box is None:
         return False
-    return not any(view.cover is not None and bool((view.cover[index] > 0.5).any()) for view in views)
+    return not any(view.cover is not None and bool((view.cover[index] > COVERED).any()) for view in views)
 
 
 def _refuse_the_unknowable(capture: Capture, bodies: Sequence[Body], ground: Ground | None) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..geometry.spheres import Spheres
 from .losses import cover_of
-from .views import View, render_view
+from .views import SURELY_COVERED, View, render_view
 
 
 def mean_colors(spheres: Spheres, views: Sequence[View], body: int | None = None) -> Tensor:
@@ -31,7 +31,7 @@ def mean_colors(spheres: Spheres, views: Sequence[View], body: int | None = None
         image = render_view(colored, view).features[0]
         photo = torch.cat([view.image, torch.ones_like(view.image[..., :1])], -1)
         if body is not None:
-            photo = photo * (cover_of(view)[body] > 0.95)[..., None]
+            photo = photo * (cover_of(view)[body] > SURELY_COVERED)[..., None]
         total += torch.autograd.grad((image * photo).sum(), features)[0]
     return spread_colors(spheres.means, total[:, :-1] / total[:, -1:].clamp_min(1e-6), total[:, -1])
 

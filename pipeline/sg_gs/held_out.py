@@ -16,7 +16,7 @@ from ..rendering.contact_sheets import SHEET_BYTES, compared, small_png
 from ..rendering.image_metrics import psnr, ssim_map
 from .camera_refinement import find_motion, moved
 from .photo_exposure import least_squares_gain
-from .views import View, as_bytes, camera_center, render_view
+from .views import COVERED, View, as_bytes, camera_center, render_view
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, sp
         whole.append(psnr(picture, view.image))
         similar.append(float(ssim_map(picture, view.image).mean()))
         if view.cover is not None and bodies:
-            true, mine = view.cover.sum(0) > 0.5, features[..., 3] > 0.5
+            true, mine = view.cover.sum(0) > COVERED, features[..., 3] > COVERED
             if true.any():
                 inside.append(psnr(picture, view.image, true))
                 overlap.append(float((true & mine).sum() / (true | mine).sum()))

@@ -16,7 +16,7 @@ from ..geometry.solid_grid import Array, Volume, grid_points
 from ..geometry.spheres import Spheres
 from .collision_spheres import inscribed_radii
 from .losses import scene_weight
-from .views import View, focus_of
+from .views import COVERED, View, focus_of
 
 _SURFACE_SHARE = 0.9
 _COVER_FACTOR = 1.05  # collision radius in units of the spacing: neighbours overlap without a gap
@@ -158,7 +158,7 @@ def _off_ground_points(
 
 def shows_bodies(views: Sequence[View]) -> bool:
     """Return whether a mask shows a body."""
-    return any(view.cover is not None and bool((view.cover > 0.5).any()) for view in views)
+    return any(view.cover is not None and bool((view.cover > COVERED).any()) for view in views)
 
 
 def _on_bodies(points: Array, views: Sequence[View]) -> Array:
@@ -170,7 +170,7 @@ def _on_bodies(points: Array, views: Sequence[View]) -> Array:
         width, height = view.size
         visible, column, row = view.camera.resized(width, height).pixels_of(points)
         cover = view.cover.sum(0).cpu().numpy()
-        inside += visible & (cover[row, column] > 0.5)
+        inside += visible & (cover[row, column] > COVERED)
         seen += visible
     return inside > 0.6 * np.maximum(seen, 1)
 

@@ -13,7 +13,7 @@ from torch.nn import functional
 from ..geometry.spheres import Spheres
 from ..rendering.image_metrics import photometric
 from .photo_exposure import Exposures
-from .views import View, render_view
+from .views import SURELY_COVERED, View, render_view
 
 if TYPE_CHECKING:
     from .camera_refinement import Motions
@@ -102,7 +102,7 @@ def body_loss(body: int, exposures: Exposures) -> Loss:
         output = render_view(spheres, view)
         cover = cover_of(view)
         mine = cover[body][..., None]
-        exposures.follow(view, output.features[0].detach(), cover[body] > 0.95)
+        exposures.follow(view, output.features[0].detach(), cover[body] > SURELY_COVERED)
         picture = exposures.gain(view) * output.features[0] + (1 - output.alpha[0])[..., None] * background
         others = (cover.sum(0) - cover[body])[..., None]
         # Pixels at the border mix body and background; the colour of the body in them is unknown.

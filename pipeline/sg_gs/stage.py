@@ -22,7 +22,7 @@ from .context import Stage
 from .held_out import HeldOut, look
 from .link_bodies import link_results
 from .turntable import turntable, upward
-from .views import as_bytes, load_views
+from .views import COVERED, as_bytes, load_views
 
 _MIN_PHOTOS = 3
 _UNEVEN_DB = 1.0
@@ -186,6 +186,6 @@ def _separated(stage: Stage) -> dict[str, bytes]:
     stage.train, stage.test = found.train, found.test
     stage.record["separation"] = found.record
     stage.warnings += found.warnings
-    masks = [(view.cover > 0.5).any(0).cpu().numpy() for view in found.train if view.cover is not None]
+    masks = [(view.cover > COVERED).any(0).cpu().numpy() for view in found.train if view.cover is not None]
     photos = [as_bytes(view.image) for view in found.train]
     return {"separation.png": small_png(separated(photos, masks), SHEET_BYTES)}

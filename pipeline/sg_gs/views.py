@@ -21,6 +21,8 @@ from ..geometry.spheres import Spheres
 from ..rendering.render import RenderOutput, render
 from .visual_hull import Silhouette
 
+COVERED, SURELY_COVERED = 0.5, 0.95
+"""Cover by a mask from which on a pixel counts as the body's, and as its inside, where no edge blends colours."""
 _FINE_SIZE = 800
 _MARGIN_PX = 6
 
@@ -144,9 +146,9 @@ def body_windows(views: Sequence[View], body: int) -> list[View]:
     """Return windows of the views around the mask of a body; views without it are omitted."""
     windows = []
     for view in views:
-        if view.cover is None or not bool((view.cover[body] > 0.5).any()):
+        if view.cover is None or not bool((view.cover[body] > COVERED).any()):
             continue
-        rows, columns = (view.cover[body] > 0.5).nonzero(as_tuple=True)
+        rows, columns = (view.cover[body] > COVERED).nonzero(as_tuple=True)
         width, height = view.size
         left, top = max(int(columns.min()) - _MARGIN_PX, 0), max(int(rows.min()) - _MARGIN_PX, 0)
         right, bottom = min(int(columns.max()) + _MARGIN_PX, width - 1), min(int(rows.max()) + _MARGIN_PX, height - 1)

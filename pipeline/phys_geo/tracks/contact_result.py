@@ -28,6 +28,8 @@ from .open_loop_search import ENOUGH_EPISODES, ERRORS_PER_EPISODE
 
 KEPT_NOTE = "of the model that the fit started from, as these episodes do not observe it; "
 """Beginning of the note of an estimate that was kept."""
+MENTIONED_GROWTH = 1.05
+"""Growth of the variances of a fit to few episodes from which on their warning states it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,7 +272,7 @@ def _interval_assumption(shooting: ShootingRecord | None) -> str:
     """Return the assumption behind the intervals of a fit to few episodes."""
     if shooting is None or not shooting.kept:
         return f"that one episode contains {ERRORS_PER_EPISODE:g} independent errors of the contact model"
-    if shooting.information_over >= 1.05:
+    if shooting.information_over >= MENTIONED_GROWTH:
         return (
             "that the errors of the contact model widen them to "
             f"{shooting.information_over**0.5:.2g} times what the noise alone would give"
