@@ -76,6 +76,37 @@ def sample_surface(mesh: Mesh, spacing: float) -> Array:
     return np.concatenate(found)
 
 
+def distance_to_mesh(mesh: Mesh, points: Array) -> Array:
+    """Return the exact distance (n,) [m] of points (n, 3) from the nearest triangle of a mesh.
+
+    Source: closest point of a triangle by its regions (Ericson, "Real-Time Collision Detection", 2005, section 5.1.5).
+    """
+    corners = mesh.vertices[mesh.faces]
+    return np.array([float(np.sqrt(_squares_to(corners, point).min())) for point in points])
+
+
+def _squares_to(corners: Array, point: Array) -> Array:
+    """Return the squared distances (F,) [m2] of a point from triangles (F, 3, 3)."""
+    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(ab, ac)
+    area2 = (normal * normal).sum(1)
+    away = point - a
+    with np.errstate(divide="ignore", invalid="ignore"):
+        v = (np.cross(away, ac) * normal).sum(1) / area2
+        w = (np.cross(ab, away) * normal).sum(1) / area2
+        plane = (away * normal).sum(1) ** 2 / area2
+    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (area2 > 0)
+    edges = [_squares_to_segment(corners[:, k], corners[:, (k + 1) % 3], point) for k in range(3)]
+    return np.where(inside, plane, np.min(edges, axis=0))
+
+
+def _squares_to_segment(start: Array, end: Array, point: Array) -> Array:
+    along = end - start
+    share = ((point - start) * along).sum(1) / np.maximum((along * along).sum(1), 1e-30)
+    foot = start + share.clip(0, 1)[:, None] * along
+    return ((point - foot) ** 2).sum(1)
+
+
 def _inside(mesh: Mesh, origin: Array, pitch: float, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Return which grid points lie inside, by the parity of crossings along z."""
     flips = np.zeros(shape, dtype=np.int32)

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
+from ...datasets.shapes.meshes import Mesh
 from ...datasets.shapes.ply import Splats, read_splats
 from ...schemas import InputDataError, Shape
 from ..geometry.directions import fibonacci_directions
-from ..geometry.mesh import mesh_volume, read_mesh
+from ..geometry.mesh import distance_to_mesh, mesh_volume, read_mesh
 from ..geometry.primitives import spheres_volume
 from ..geometry.solid_grid import Array, Volume, grid_points
 from ..geometry.surface_distance import union_distance
@@ -157,7 +158,11 @@ def distil(solid: Solid, max_spheres: int, first: tuple[Array, Array] | None = N
             "solid shapes that are not thin for their length.",
             "divide a long thin body into shorter ones, or give it spheres: shape = { splats = { path = ... } }.",
         )
-    centers, radii = chosen.arrays()
+    return _measured(solid, points, *chosen.arrays())
+
+
+def _measured(solid: Solid, points: Array, centers: Array, radii: Array) -> CollisionSpheres:
+    """Return spheres with their errors against a solid and points on its surface (n, 3)."""
     gap = np.abs(union_distance(centers, radii, points)).max()
     beyond = float((solid.at(centers) + radii).max())
     support = np.abs(support_of_points(solid.surface) - support_of_spheres(centers, radii)).max()
@@ -362,8 +367,9 @@ def _from_mesh(path: Path, max_spheres: int) -> CollisionSpheres:
     Raises:
         InputDataError: If the file is not readable, or the solid is so thin that spheres fit in single places alone.
     """
-    solid = mesh_volume(read_mesh(path))
-    spheres = distil(solid, max_spheres)
+    mesh = read_mesh(path)
+    solid = mesh_volume(mesh)
+    spheres = _within(distil(solid, max_spheres), solid, mesh)
     if spheres.distance_m > _BARE_SHARE * solid.size():
         raise InputDataError(
             f"{path}: spheres fit inside the mesh in single places alone, {spheres.distance_m:.2g} m from the farthest "
@@ -372,6 +378,19 @@ def _from_mesh(path: Path, max_spheres: int) -> CollisionSpheres:
             "divide a long thin body into shorter ones, or give it spheres: shape = { splats = { path = ... } }.",
         )
     return spheres
+
+
+def _within(spheres: CollisionSpheres, solid: Volume, mesh: Mesh) -> CollisionSpheres:
+    """Return the spheres with radii up to the exact distance from a mesh; the smallest ones, at its edges, as they are.
+
+    On a grid, spheres protrude from flat faces by up to its pitch, most of them in the middle of the face: a body would
+    lie on a dome, and roll on it without end.
+    """
+    kept = spheres.radii <= 1.2 * _SMALLEST_RADIUS * solid.size()
+    exact = distance_to_mesh(mesh, spheres.centers)
+    radii = np.where(kept, spheres.radii, np.minimum(spheres.radii, exact))
+    points = solid.surface[:: max(1, len(solid.surface) // _SAMPLES)]
+    return _measured(solid, points, spheres.centers, radii)
 
 
 def _from_splats(splats: Splats, max_spheres: int, radius_factor: float) -> CollisionSpheres:

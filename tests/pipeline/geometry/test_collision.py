@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cgwm.datasets.shapes.meshes import Mesh
-from cgwm.datasets.synthetic.objects import make_object
+from cgwm.datasets.synthetic.objects import make_object, write_obj
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.geometry.mesh import mesh_mass_properties, mesh_volume, read_mesh
 from cgwm.pipeline.geometry.primitives import spheres_volume
@@ -17,6 +17,7 @@ from cgwm.pipeline.sg_gs.collision_spheres import (
     union_distance,
 )
 from cgwm.schemas import InputDataError, Shape
+from scipy.spatial import ConvexHull
 
 HALF = np.array([0.05, 0.03, 0.02])
 DIRECTIONS = fibonacci_directions(400)
@@ -120,6 +121,18 @@ def test_meshes_from_files(tmp_path, ellipsoid):
     assert mesh_mass_properties(flipped).volume_m3 == pytest.approx(mesh_mass_properties(mesh).volume_m3, rel=1e-5)
     splats, _ = shape_to_spheres(Shape.model_validate({"mesh": {"path": "ball.obj"}}), tmp_path, 60)
     assert len(splats) <= 60
+
+
+def test_a_flat_face_of_a_mesh_stands_on_its_corners_and_edges(tmp_path):
+    """What protrudes in the middle of a face makes a dome of it, on which the body rolls."""
+    prism = make_object(6)
+    write_obj(tmp_path / "prism.obj", prism)
+    splats, _ = shape_to_spheres(Shape.model_validate({"mesh": {"path": "prism.obj"}}), tmp_path, 100)
+    faces = np.unique(ConvexHull(prism.parts[0]).equations.round(9), axis=0)
+    above = splats.means @ faces[:, :3].T + 2 * splats.scales[:, None] + faces[:, 3]
+    large = 2 * splats.scales > 0.001
+    assert large.sum() > 50 and above[large].max() < 1e-6
+    assert 0 <= above.max() < 1e-3
 
 
 def test_a_mesh_in_which_spheres_fit_at_the_corners_alone_is_refused(tmp_path):
