@@ -56,6 +56,24 @@ def _pair(first: str | None, second: str | None) -> Pair | None:
     return None if first is None or second is None else pair_of(first, second)
 
 
+def with_pusher_law(manifest: CaptureManifest) -> CaptureManifest:
+    """Return a manifest of one moved body in which contact with a driven body without material is a pair of its own.
+
+    Both get their name as material, as far as they have none; the ground stays as it is, so that the moved body and it
+    keep the contact of all other pairs. Manifests of several moved bodies, or of links, are returned as they are.
+    """
+    moved = [body for body in manifest.bodies if body.motion in MOVED]
+    unnamed = {body.name for body in manifest.bodies if body.motion == "driven" and body.material is None}
+    taken = {material.name for material in manifest.materials}
+    if len(moved) != 1 or manifest.articulations or not unnamed or (unnamed | {moved[0].name}) & taken:
+        return manifest
+    named = unnamed | ({moved[0].name} if moved[0].material is None else set())
+    bodies = tuple(
+        body.model_copy(update={"material": body.name}) if body.name in named else body for body in manifest.bodies
+    )
+    return manifest.model_copy(update={"bodies": bodies})
+
+
 def given_numbers(manifest: CaptureManifest) -> dict[Pair, dict[str, float]]:
     """Return the contact parameters of pairs of materials that a capture knows, by pair and name."""
     single = {material.name: material.friction for material in manifest.materials}

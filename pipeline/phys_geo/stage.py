@@ -38,7 +38,7 @@ from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.described_motion import not_described
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
-from .material_pairs import require_known_pairs, start_laws
+from .material_pairs import require_known_pairs, start_laws, with_pusher_law
 from .surface_starts import require_outside
 from .tracks.contact_result import PhysicsFit
 from .tracks.earlier_estimates import GROUND, EarlierEstimates
@@ -71,6 +71,7 @@ def fit_motion(
     """
     _require_fittable(model, capture, config)
     require_known_pairs(capture, split)
+    capture = replace(capture, manifest=with_pusher_law(capture.manifest))
     ready = _with_surfaces(replace(model, file=_physics_start(model, capture, config)), capture)
     if config.supervise == "tracks":
         require_outside(World.from_model(ready), capture, split)

@@ -64,11 +64,15 @@ def _gap_to_fixed(other: Body, centers: Tensor, radii: Tensor) -> Tensor:
 
 def flight_frames(world: World, observations: Observations) -> Tensor:
     """Return the frames (B, T) before each item's first contact."""
+    return separate_frames(world, observations).to(observations.times_s.dtype).cumprod(1) > 0
+
+
+def separate_frames(world: World, observations: Observations) -> Tensor:
+    """Return the frames (B, T) at which no free body touches anything, nor has since the frame before."""
     gap = clearance(world, observations)
     move = torch.zeros_like(gap)
     move[:, 1:] = gap.diff(dim=1).abs()
-    free = gap > FLIGHT_MARGIN_M + 0.75 * torch.nan_to_num(move, posinf=0.0)
-    return free.to(gap.dtype).cumprod(1) > 0
+    return gap > FLIGHT_MARGIN_M + 0.75 * torch.nan_to_num(move, posinf=0.0)
 
 
 def warmup_frames(world: World, observations: Observations, warmup_s: float) -> Tensor:

@@ -270,7 +270,9 @@ def _numbers(
 
 def _interval_assumption(shooting: ShootingRecord | None) -> str:
     """Return the assumption behind the intervals of a fit to few episodes."""
-    if shooting is None or not shooting.kept:
+    if shooting is not None and not shooting.kept:
+        return "that the search, whose estimate is kept, errs by as much as it differs from multiple shooting"
+    if shooting is None:
         return f"that one episode contains {ERRORS_PER_EPISODE:g} independent errors of the contact model"
     if shooting.information_over >= MENTIONED_GROWTH:
         return (

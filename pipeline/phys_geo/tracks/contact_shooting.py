@@ -60,6 +60,9 @@ def shoot_contact(
 ) -> tuple[ContactEstimate, ShootingRecord]:
     """Fit the contact parameters by multiple shooting, and keep the search's estimate if shooting predicts worse.
 
+    The scatter of the search's samples knows neither of the errors of the start state nor of those of the contact
+    model. Where its estimate is kept, the covariance is that of shooting and of how far the two lie apart.
+
     Args:
         world: The world.
         data: The episodes.
@@ -78,7 +81,8 @@ def shoot_contact(
     shared, covariance, growth = tempered(shot, prior, MODEL_EXCESS)
     errors = open_loop_errors(world, data.batch.observations, data.batch.warm, parameters)
     cost = float(errors(shared[None]).mean())
-    keep = math.isfinite(shot.cost) and math.isfinite(cost) and cost <= OPEN_LOOP_TOLERANCE * search.lowest
+    finite = math.isfinite(shot.cost) and math.isfinite(cost)
+    keep = finite and cost <= OPEN_LOOP_TOLERANCE * search.lowest
     record = ShootingRecord(
         costs=[one.cost for one in shots],
         converged=shot.converged,
@@ -90,13 +94,21 @@ def shoot_contact(
         kept=keep,
     )
     if not keep:
-        return ContactEstimate(parameters=names, values=search.mean, covariance=search.covariance), record
+        covariance = _apart(search, shared, covariance) if finite else search.covariance
+        return ContactEstimate(parameters=names, values=search.mean, covariance=covariance), record
     first = data.batch.observations
     starts = {
         name: (float(time), shot.state.at([row]))
         for row, (name, time) in enumerate(zip(first.names, first.times_s[:, 0], strict=True))
     }
     return ContactEstimate(parameters=parameters, values=shared, covariance=covariance, starts=starts), record
+
+
+def _apart(search: SearchResult, shared: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the covariance of the search's estimate (P, P) by that of shooting, which may have one parameter more."""
+    count = len(search.mean)
+    apart = search.mean - shared[:count]
+    return covariance[:count, :count] + np.outer(apart, apart)
 
 
 def _with_ground(world: World, names: Sequence[Parameter], ground_known: bool) -> list[Parameter]:

@@ -14,7 +14,7 @@ from ....datasets.capture.tracks import Episode
 from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ...optimization.problem import NormalEquations
 from ...physics.world import State, World
-from ...trajectories.initial_state import FLIGHT_MARGIN_M, clearance
+from ...trajectories.initial_state import FLIGHT_MARGIN_M, clearance, separate_frames
 from ...trajectories.observations import Observations
 from ...trajectories.track_noise import Noise
 
@@ -42,6 +42,8 @@ class TiedSegments:
     """Frame at which the next segment begins, or the last one, shape (B,)."""
     ahead: State
     """Alternative first guess of the states, which moves to the next frame in a straight line."""
+    driven: Tensor
+    """Whether a driven body may touch in the segment, shape (B,)."""
 
     @staticmethod
     def of(
@@ -71,6 +73,7 @@ class TiedSegments:
             following=torch.tensor(following),
             end=torch.tensor(end),
             ahead=ahead,
+            driven=_driven(world, whole, pieces),
         )
 
 
@@ -201,6 +204,14 @@ def _informative(world: World, whole: Observations, pieces: Sequence[_Piece], no
     moving = [touch and bool(way > RESTING_SIGMAS) for touch, way in zip(touches, moved, strict=True)]
     padded = [False, *moving, False]
     return [any(padded[row : row + 3]) for row in range(len(pieces))]
+
+
+def _driven(world: World, whole: Observations, pieces: Sequence[_Piece]) -> Tensor:
+    """Return in which segments (B,) a driven body may touch a free one, by the gaps at their frames."""
+    if not whole.drives:
+        return torch.zeros(len(pieces), dtype=torch.bool)
+    apart = separate_frames(replace(world, ground_normal=None), whole)
+    return torch.tensor([not bool(apart[k, a : b + 1].all()) for k, a, b in pieces])
 
 
 def _moving(world: World, whole: Observations, items: list[int], starts: list[int], state: State) -> State:
