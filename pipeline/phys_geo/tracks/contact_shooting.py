@@ -21,9 +21,11 @@ from .multiple_shooting import Shooting, ShootingFit, ShootingPrior
 from .open_loop_search import SEVERAL_EPISODES, SearchBatch, open_loop_errors
 from .tempered_posterior import tempered
 
-OPEN_LOOP_TOLERANCE = 3.0
-"""Maximum ratio of the open-loop error of shooting to that of the search; above it the search's estimate is kept. The
-search may fit its three parameters to the end of a single rough motion, so a moderately larger error is accepted."""
+OPEN_LOOP_TOLERANCE = 2.0
+"""Maximum ratio of the open-loop error of shooting to that of the search, for bodies that nothing drives; above it the
+search's estimate is kept. In a rough motion over impacts its numbers make up for what the contact model lacks, and
+predict other tosses better, the rotation by a third; pushes are predicted better by those of shooting (28 motions of
+MuJoCo, DART and Rapier)."""
 STARTS = ((0.5, 1.0), (1.0, 1.0), (1.7, 1.0), (1.0, 0.6), (1.0, 1.6))
 """Further starts of shooting: friction and contact time as multiples of the priors' medians."""
 BEST = 3
@@ -82,7 +84,8 @@ def shoot_contact(
     errors = open_loop_errors(world, data.batch.observations, data.batch.warm, parameters)
     cost = float(errors(shared[None]).mean())
     finite = math.isfinite(shot.cost) and math.isfinite(cost)
-    keep = finite and cost <= OPEN_LOOP_TOLERANCE * search.lowest
+    pushed = bool(data.batch.observations.drives)
+    keep = finite and (pushed or cost <= OPEN_LOOP_TOLERANCE * search.lowest)
     record = ShootingRecord(
         costs=[one.cost for one in shots],
         converged=shot.converged,
