@@ -51,6 +51,8 @@ class SplatConfig(FileModel):
     """Learn a gain of each colour channel for every photo: for photos whose exposure or white balance varies."""
     refine_poses: bool = False
     """Refine the poses of the photos' cameras first; the model then holds them in `cameras.json`."""
+    bare_ground: bool = True
+    """Lift the shadow that moving bodies cast on the ground in the photos, and fill in the ground that they hid."""
     turntable: bool = True
     """Write a film around what was fitted, `turntable.mp4`."""
     collision: Literal["distilled", "visual"] = "distilled"

@@ -21,7 +21,7 @@ from ..geometry.spheres import Spheres
 from ..geometry.surface_distance import Union
 from ..geometry.viewpoint import rotation_matrix
 from .collision_spheres import distil, shape_to_spheres
-from .colors import mean_colors
+from .colors import VISIBLE_PX, mean_colors, observed_colors, spread_colors
 from .context import Stage
 from .depth_refinement import refine
 from .initialization import body_seeds, to_spheres
@@ -152,7 +152,9 @@ def _fit_spheres(stage: Stage, index: int, body: Body, solid: Volume) -> Spheres
         rate = config.geometry_rate
         geometry = Rates(rate * geometry.means, rate * geometry.log_scales, geometry.logits)
     even = [stage.exposures.even(window) for window in windows]
-    spheres = replace(spheres, colors=mean_colors(spheres, even, index))
+    colors, seen = observed_colors(spheres, even, index)
+    spheres = replace(spheres, colors=spread_colors(spheres.means, colors, seen))
+    record["unseen_spheres"] = _say_unseen(body.name, solid, spheres, seen)
     appearance = Trainable(spheres, replace(geometry, colors=0.02))
     losses = descend(
         appearance,
@@ -168,6 +170,16 @@ def _fit_spheres(stage: Stage, index: int, body: Body, solid: Volume) -> Spheres
     record |= {"appearance_loss": thinned(losses), "seconds": round(time.perf_counter() - started, 2)}
     stage.record[body.name] = stage.record.get(body.name, {}) | record
     return detached(appearance.spheres())
+
+
+def _say_unseen(name: str, solid: Volume, spheres: Spheres, seen: Tensor) -> int:
+    """Return how many spheres at the surface of a body no photo shows, such as its underside, and say so."""
+    outer = -solid.at(spheres.means.detach().cpu().numpy().astype(float)) < 2 * spheres.scales.cpu().numpy()
+    hidden = int(((seen < VISIBLE_PX).cpu().numpy() & outer).sum())
+    if hidden:
+        note(f"{name}: {hidden} of {int(outer.sum())} spheres at its surface, which no photo shows, get the colours of "
+             "those beside them")  # fmt: skip
+    return hidden
 
 
 def _fit_geometry(

@@ -11,12 +11,23 @@ from ..geometry.spheres import Spheres
 from .losses import cover_of
 from .views import SURELY_COVERED, View, render_view
 
+VISIBLE_PX = 0.5
+"""Least weight of a visible sphere in all photos together [px]."""
+
 
 def mean_colors(spheres: Spheres, views: Sequence[View], body: int | None = None) -> Tensor:
     """Return the mean colour of each sphere over the pixels that show it, weighted by its contribution, shape (N, F).
 
-    The derivative of sum(render * photo) by the colours is sum over pixels of weight * photo. A sphere that no photo
-    shows gets the mean colour of the nearest visible ones.
+    A sphere that no photo shows gets the mean colour of the nearest visible ones. Arguments as of `observed_colors`.
+    """
+    colors, seen = observed_colors(spheres, views, body)
+    return spread_colors(spheres.means, colors, seen)
+
+
+def observed_colors(spheres: Spheres, views: Sequence[View], body: int | None = None) -> tuple[Tensor, Tensor]:
+    """Return the mean colour of each sphere over the pixels that show it (N, F), and its weight in them [px] (N,).
+
+    The derivative of sum(render * photo) by the colours is sum over pixels of weight * photo.
 
     Args:
         spheres: The spheres, world frame.
@@ -33,7 +44,7 @@ def mean_colors(spheres: Spheres, views: Sequence[View], body: int | None = None
         if body is not None:
             photo = photo * (cover_of(view)[body] > SURELY_COVERED)[..., None]
         total += torch.autograd.grad((image * photo).sum(), features)[0]
-    return spread_colors(spheres.means, total[:, :-1] / total[:, -1:].clamp_min(1e-6), total[:, -1])
+    return total[:, :-1] / total[:, -1:].clamp_min(1e-6), total[:, -1]
 
 
 def sphere_weights(spheres: Spheres, view: View) -> Tensor:
@@ -43,7 +54,9 @@ def sphere_weights(spheres: Spheres, view: View) -> Tensor:
     return torch.autograd.grad(image.sum(), features)[0][:, 0]
 
 
-def spread_colors(means: Tensor, colors: Tensor, seen: Tensor, least: float = 0.5, neighbours: int = 4) -> Tensor:
+def spread_colors(
+    means: Tensor, colors: Tensor, seen: Tensor, least: float = VISIBLE_PX, neighbours: int = 4
+) -> Tensor:
     """Return the colours, with those of hardly visible spheres replaced by the mean of the nearest visible ones.
 
     Args:

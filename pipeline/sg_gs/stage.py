@@ -16,6 +16,7 @@ from ..rendering.contact_sheets import SHEET_BYTES, separated, small_png
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
 from .background import fit_background, refine_poses
+from .bare_ground import bare_ground
 from .bodies import BodyResult, fit_body
 from .body_separation import separate
 from .context import Stage
@@ -78,10 +79,14 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     if stage.train and config.refine_poses:
         refine_poses(stage)
     pictures = _separated(stage)
-    results, placed = _bodies(stage)
+    results, standing = _bodies(stage)
+    placed = list(standing.values())
     scene = fit_background(stage, placed) if stage.train else None
     if stage.train:
         pictures |= _checked(stage, placed, scene)
+    if scene is not None and config.bare_ground:
+        moving = [body.name for body in capture.manifest.bodies if body.motion != "fixed"]
+        scene = bare_ground(stage, scene, [spheres for name, spheres in standing.items() if name in moving])
     stage.record["seconds"] = round(time.perf_counter() - started, 2)
     return SgGsResult(
         bodies=results,
@@ -94,19 +99,19 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     )
 
 
-def _bodies(stage: Stage) -> tuple[dict[str, BodyResult], list[Spheres]]:
+def _bodies(stage: Stage) -> tuple[dict[str, BodyResult], dict[str, Spheres]]:
     """Return the results of all bodies, and the visual spheres of those that photos show, where they lie."""
     links = link_results(stage.capture, stage.config)
     results: dict[str, BodyResult] = {}
-    placed: list[Spheres] = []
+    standing: dict[str, Spheres] = {}
     for index, body in enumerate(stage.capture.manifest.bodies):
         if body.name in links:
             results[body.name] = links[body.name]
             continue
         results[body.name], world = fit_body(stage, index, body)
         if world is not None:
-            placed.append(world)
-    return results, placed
+            standing[body.name] = world
+    return results, standing
 
 
 def _refined_cameras(stage: Stage) -> CamerasFile | None:

@@ -1,0 +1,86 @@
+"""The ground without the bodies: a cast shadow is found where there is one, and lifted; hidden ground is filled in."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from cgwm.pipeline.geometry.spheres import Spheres
+from cgwm.pipeline.sg_gs import bare_ground as ground_module
+from cgwm.pipeline.sg_gs.cast_shadow import find_shadow
+from cgwm.pipeline.sg_gs.ground_photo import CELLS, GroundPhoto
+
+CELL, HALF = 0.004, np.array([0.06, 0.04, 0.05])
+BOX = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3) * HALF + [0, 0, HALF[2]]
+TO_LAMP = np.array([0.5, 0.3, 0.8]) / np.linalg.norm([0.5, 0.3, 0.8])
+FACTORS = np.array([0.62, 0.64, 0.66])
+
+
+def _polygon(points: np.ndarray) -> np.ndarray:
+    cells = (points[:, :2] + 0.5 * CELLS * CELL) / CELL
+    image = np.zeros((CELLS, CELLS), np.uint8)
+    hull = cv2.convexHull(cells.astype(np.float32))
+    cv2.fillConvexPoly(image, np.round((hull - 0.5) * 16).astype(np.int32), 1, shift=4)
+    return image > 0
+
+
+def _photo(seed: int, shaded: bool) -> GroundPhoto:
+    """A speckled ground, with a box on it that hides the ground below."""
+    rng = np.random.default_rng(seed)
+    layer = cv2.GaussianBlur(rng.normal(size=(CELLS, CELLS, 3)), (0, 0), 3)
+    colors = np.array([0.55, 0.5, 0.45]) * (1 + 0.2 * layer / layer.std())
+    if shaded:
+        shadow = _polygon(BOX - (BOX[:, 2] / TO_LAMP[2])[:, None] * TO_LAMP)
+        colors = np.where(shadow[..., None], colors * FACTORS, colors)
+    pixels = np.where(_polygon(BOX[BOX[:, 2] < 1e-9]), 0, 10)
+    colors = np.where(pixels[..., None] > 0, colors, 0).clip(0, 1)
+    return GroundPhoto(
+        axes=np.eye(3), corner=np.full(2, -0.5 * CELLS * CELL), height=0.0, cell=CELL,
+        colors=colors.astype(np.float32), pixels=pixels.astype(np.float32),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_lamp_is_found_by_the_shadow_of_the_body(seed: int) -> None:
+    shadow = find_shadow(_photo(seed, shaded=True), [BOX])
+    assert shadow is not None
+    assert np.degrees(np.arccos(shadow.to_lamp @ TO_LAMP)) < 3
+    assert shadow.factors == pytest.approx(FACTORS, abs=0.06)  # a median of some 100 independent speckles of 20 %
+    outline = _polygon(BOX - BOX[:, 2:] / TO_LAMP[2] * TO_LAMP)
+    assert shadow.cover.sum() == pytest.approx(outline.sum(), rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_no_shadow_is_seen_in_a_texture(seed: int) -> None:
+    assert find_shadow(_photo(seed, shaded=False), [BOX]) is None
+
+
+def test_the_shadow_is_lifted_from_the_ground_alone_and_hidden_ground_is_covered() -> None:
+    photo = _photo(0, shaded=True)
+    shadow = find_shadow(photo, [BOX])
+    assert shadow is not None
+    rows, columns = (values.ravel() for values in np.meshgrid(np.arange(0, CELLS, 4), np.arange(0, CELLS, 4)))
+    points = photo.points(np.stack([columns + 0.5, rows + 0.5], 1))
+    inside = cv2.erode(shadow.cover, np.ones((3, 3)))[rows, columns] > 0.99
+    colors = np.where(inside[:, None], 0.5 * shadow.factors, 0.5)
+    above = points + np.array([0, 0, 0.1])
+    scene = Spheres(
+        torch.as_tensor(np.concatenate([points, above])).float(),
+        torch.full((2 * len(points),), 1e-4),
+        torch.full((2 * len(points),), 0.9),
+        torch.as_tensor(np.concatenate([colors, colors])).float(),
+    )
+    lifted = ground_module._lifted(scene, photo, shadow)
+    assert lifted.colors[: len(points)][inside].numpy() == pytest.approx(0.5, abs=1e-3)
+    assert torch.equal(lifted.colors[len(points) :], scene.colors[len(points) :])
+    hidden = ground_module._hidden(photo, [BOX])
+    assert hidden.sum() * CELL**2 == pytest.approx(4 * HALF[0] * HALF[1], rel=0.1)
+    bare = ground_module._inpainted(photo.colors, photo.seen, hidden)
+    filled = ground_module._filled(scene, photo, hidden, bare)
+    places = np.floor(photo.places(filled.means.double().numpy())).astype(int)
+    ground = np.abs(filled.means[:, 2].numpy()) < 1e-6
+    covered = np.zeros((CELLS, CELLS), bool)
+    covered[places[ground, 1], places[ground, 0]] = True
+    assert cv2.dilate(covered.astype(np.uint8), np.ones((3, 3)))[hidden].mean() > 0.95
+    assert filled.colors[len(filled) - 50 :].min() > 0.2
