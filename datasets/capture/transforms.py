@@ -49,7 +49,11 @@ def read_transforms(path: Path, metric: bool = False) -> CamerasFile:
     Raises:
         InputDataError: For a field that is missing or wrong, or a camera model that is not a pinhole.
     """
-    data = parse_json(read_text_file(path), path)
+    return cameras_of(parse_json(read_text_file(path), path), path, metric)
+
+
+def cameras_of(data: Any, path: Path, metric: bool = False) -> CamerasFile:
+    """Return the cameras of a `transforms.json` whose content is parsed; see :func:`read_transforms`."""
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputDataError(f"{path}: no list 'frames' with at least one frame.", todo=_EXPORT)
     cameras: dict[str, CameraIntrinsics] = {}

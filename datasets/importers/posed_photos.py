@@ -14,7 +14,7 @@ from ...schemas.imports import ImportResult
 from ...schemas.regular_files import read_text_file
 from ..capture.colmap_model import MODEL_PLACES, find_colmap_model, read_colmap_model
 from ..capture.files import optional_file
-from ..capture.transforms import matrix4, read_transforms
+from ..capture.transforms import cameras_of, matrix4
 from ..io.atomic import new_directory
 from ..io.outputs import reads
 from .photo_captures import Photo, copy_photos, inside, require_distinct, write_photo_capture
@@ -40,10 +40,11 @@ def import_nerfstudio(source: Path | str, out: Path | str, units: Units = SI, ov
     """
     with new_directory(out, "capture", overwrite) as directory:
         path = _transforms(Path(source))
-        cameras = read_transforms(path)
+        data = parse_json(read_text_file(path), path)
+        cameras = cameras_of(data, path)
         written = (path.parent / "images", path.parent)
         result = _write(directory, out, cameras, lambda name: _found(name, written), units, f"{path.name}")
-        left = _left_out(path)
+        left = _left_out(data)
         return result.model_copy(update={"warnings": (*left, *result.warnings)})
 
 
@@ -128,10 +129,9 @@ def _found(name: str, folders: tuple[Path, ...]) -> Path:
     )
 
 
-def _left_out(path: Path) -> list[str]:
+def _left_out(data: Mapping[str, Any]) -> list[str]:
     """Return what a transforms.json names and the capture does not get."""
-    data = parse_json(read_text_file(path), path)
-    frames = data["frames"] if isinstance(data, Mapping) else []
+    frames = data["frames"]
     keys = {"mask_path": "masks", "depth_file_path": "depth"}
     there = [word for key, word in keys.items() if any(key in frame for frame in frames)]
     return [f"not taken over: {' and '.join(there)} (put them into the capture by hand)"] if there else []
