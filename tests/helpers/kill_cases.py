@@ -16,6 +16,7 @@ from cgwm.pipeline.sg_gs.depth_refinement import Refinement
 from cgwm.schemas import task_toml
 from helpers.pushing import push_task
 from helpers.small_model import write_small_model
+from helpers.target_photos import write_photos
 from helpers.thrown_cube import write_capture
 from helpers.tiny_capture import FAST, model_of, thrown, write_tiny_capture
 from pipeline.sg_gs.test_sg_gs import make_capture
@@ -69,6 +70,13 @@ def _calibrate(folder: Path) -> Command:
     words = ["calibrate", str(root), *_settings("calibrate.max_features=500", "calibrate.retries=0")]
     out = tuple(f"capture/{name}" for name in ("cameras.json", "calibration.json", "sparse_points.ply"))
     return Command(words=words, out=out, check=(["validate", str(root)],))
+
+
+def _target(folder: Path) -> Command:
+    write_photos(folder / "board", 9)
+    out = "board/intrinsics.json"
+    words = ["calibrate", str(folder / "board"), "--target", "charuco"]
+    return Command(words=words, out=(out,), check=(["validate", str(folder / out)],))
 
 
 def _photos(folder: Path) -> Command:
@@ -185,6 +193,7 @@ def _control(folder: Path) -> Command:
 CASES: dict[str, Callable[[Path], Command]] = {
     "calibrate": _calibrate,
     "calibrate --overwrite": _replacing(_calibrate, "--seed", "5", "--set", "calibrate.max_features=600"),
+    "calibrate target": _target,
     "fit photos": _photos,
     "fit photos --overwrite": _replacing(_photos, "--seed", "5"),
     "fit tracks": _tracks,
