@@ -16,5 +16,6 @@ def test_a_kill_at_random_moments_loses_nothing(name: str) -> None:
     tests = Path(__file__).parents[1]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tests), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-m", "helpers.kill_run", "50", "--only", name]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    # not in the root, whose folder cgwm/ would be found before the installed package
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tests)
     assert done.returncode == 0, done.stdout + done.stderr
