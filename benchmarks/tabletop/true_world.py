@@ -137,7 +137,7 @@ def _predicted(world: World, episode: EpisodePlan, times_s: Array) -> tuple[Arra
     motion = episode.motion
     row = motion.row(0.0)
     pose, rate = motion.qpos[row], motion.qvel[row]
-    tracks = {FINGERTIP: _track(episode)} if len(world.bodies) > 1 else {}
+    tracks = {FINGERTIP: finger_track(episode)} if len(world.bodies) > 1 else {}
     start = State(*(_stacked(len(world.bodies), values) for values in (pose[:3], pose[3:7], rate[:3], rate[3:6])))
     with torch.no_grad():
         rollout = measure(world, start, torch.as_tensor(times_s), tracks)
@@ -150,7 +150,8 @@ def _stacked(bodies: int, values: Array) -> torch.Tensor:
     return torch.as_tensor(np.stack([values, *[rest] * (bodies - 1)]), dtype=torch.float64)[None]
 
 
-def _track(episode: EpisodePlan) -> Track:
+def finger_track(episode: EpisodePlan) -> Track:
+    """Return the fingertip's path from time zero on: its command."""
     motion, every = episode.motion, STEPS_PER_S // _TRACK_HZ
     rows = np.arange(motion.row(0.0), len(motion.qpos), every)
     turns = np.tile([1.0, 0, 0, 0], (len(rows), 1))
