@@ -143,7 +143,7 @@ def _least_squares_point(point: Array, poses: Array, rays: Array, focal: Array) 
     weight = (focal / (rotation[:, 2] @ point + shift[:, 2]))[:, None]
     matrix = (rotation[:, :2] - rays[:, :, None] * rotation[:, 2:]) * weight[..., None]
     right = (rays * shift[:, 2:] - shift[:, :2]) * weight
-    return np.linalg.lstsq(matrix.reshape(-1, 3), right.ravel(), rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(matrix.reshape(-1, 3), right.ravel(), rcond=None)[0], np.float64)
 
 
 def _midpoints(centers: Array, directions: Array) -> Array:
