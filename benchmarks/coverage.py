@@ -14,11 +14,8 @@ whose spheres were learned from photos of the object.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-import os
 import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -40,7 +37,7 @@ from cgwm.pipeline.runtime.device import resolve_device
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import FittedParameter, PhysConfig, SplatConfig
 from numpy.typing import NDArray
-from store import Store, timed
+from store import Store
 
 Array = NDArray[np.float64]
 Device = Literal["cpu", "cuda"]
@@ -134,11 +131,6 @@ def measure(seed: int, truth_engine: str, supervise: str, device: Device) -> dic
     return {"parameters": rows}
 
 
-def timed_measure(seed: int, truth_engine: str, supervise: str, device: Device) -> dict[str, Any]:
-    """Measure a seed in a worker."""
-    return timed(lambda: measure(seed, truth_engine, supervise, device))
-
-
 def main() -> int:
     """Print one JSON line a seed and the coverage; return 1 if it is below 80 % for any parameter."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -149,17 +141,12 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
     options = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
     first, last = options.seeds.split("-")
     store, hits, errors = Store("coverage", options.store), {}, {}
     how = (options.truth, options.supervise, options.device)
-    seeds = {seed: ", ".join((f"seed {seed}", *how)) for seed in range(int(first), int(last) + 1)}
-    with ProcessPoolExecutor(options.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        missing = [seed for seed, key in seeds.items() if store.known(key) is None]
-        waiting = {pool.submit(timed_measure, seed, *how): seed for seed in missing}
-        for done in as_completed(waiting):
-            store.add(seeds[waiting[done]], done.result())
-    for row in (row for row in store.results() if row["key"] in seeds.values()):
+    seeds = {", ".join((f"seed {seed}", *how)): seed for seed in range(int(first), int(last) + 1)}
+    store.fill(measure, {key: (seed, *how) for key, seed in seeds.items()}, options.workers)
+    for row in (row for row in store.results() if row["key"] in seeds):
         for name, (truth, estimate, _, _, held) in row["parameters"].items():
             hits.setdefault(name, []).append(held)
             errors.setdefault(name, []).append(abs(estimate / truth - 1))

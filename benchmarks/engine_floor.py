@@ -20,11 +20,8 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import multiprocessing
-import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -33,7 +30,7 @@ from typing import Any
 import numpy as np
 from cgwm.datasets.synthetic.dynamics import GRAVITY, rest_pose
 from cgwm.schemas import NotConvergedError
-from store import Store, timed
+from store import Store
 from tabletop.capture import TASKS, Task, plan_capture
 from tabletop.engines import ENGINES, refusal
 from tabletop.materials import MATERIALS
@@ -217,17 +214,9 @@ def main() -> int:
     if given.what == "table":
         print(table(store.results()))
         return 0
-    os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
     wanted = jobs(given.stage, given.engines.split(","), given.captures, given.tests)
     best = best_numbers([row for row in store.results() if row["stage"] == "dev"]) if given.stage == "report" else {}
-    with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        waiting = {pool.submit(_timed, job, _tried(job, best)): job for job in wanted if store.known(job.key) is None}
-        try:
-            for done in as_completed(waiting):
-                store.add(waiting[done].key, vars(waiting[done]) | done.result())
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)  # else what waits runs to its end before the error is seen
-            raise
+    store.fill(_row, {job.key: (job, _tried(job, best)) for job in wanted}, given.workers)
     return 0
 
 
@@ -238,8 +227,8 @@ def _tried(job: Job, best: dict[tuple[str, str], str]) -> tuple[str, ...]:
     return tuple(best[key] for key in ((job.engine, job.material),) if key in best)
 
 
-def _timed(job: Job, tried: Sequence[str]) -> dict[str, Any]:
-    return timed(lambda: measure(job, tried))
+def _row(job: Job, tried: Sequence[str]) -> dict[str, Any]:
+    return vars(job) | measure(job, tried)
 
 
 if __name__ == "__main__":

@@ -12,11 +12,8 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import multiprocessing
-import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
@@ -30,7 +27,7 @@ from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
 from cgwm.pipeline.physics.world import World
 from cgwm.schemas import NotConvergedError, PhysConfig
-from store import Store, timed
+from store import Store
 from tabletop.capture import Task, plan_capture
 from tabletop.engines import ENGINES, refusal
 from tabletop.materials import MATERIALS
@@ -136,18 +133,14 @@ def main() -> int:
         parser.error(f"--engines: {unknown[0]!r} is none of {', '.join(ENGINES)}")
     store = Store("one_motion", None, given.any_commit)
     if given.what == "run":
-        os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
         wanted = jobs(given.engines.split(","), given.objects.split(","), [int(s) for s in given.seeds.split(",")])
-        with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            waiting = {pool.submit(_timed, job): job for job in wanted if store.known(job.key) is None}
-            for done in as_completed(waiting):
-                store.add(waiting[done].key, vars(waiting[done]) | done.result())
+        store.fill(_row, {job.key: (job,) for job in wanted}, given.workers)
     print(table(store.results()))
     return 0
 
 
-def _timed(job: Job) -> dict[str, Any]:
-    return timed(lambda: measure(job))
+def _row(job: Job) -> dict[str, Any]:
+    return vars(job) | measure(job)
 
 
 if __name__ == "__main__":

@@ -7,11 +7,13 @@ all. Where git is not there (a copy of the files on another machine), `CGWM_COMM
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -69,6 +71,25 @@ class Store:
         print(json.dumps(row), flush=True)
         return row
 
+    def fill(self, work: Callable[..., dict[str, Any]], arguments: Mapping[str, tuple[Any, ...]], workers: int) -> None:
+        """Store what `work` returns for the arguments of each key that has no result, from processes of one thread.
+
+        Args:
+            work: A function of a module, which the processes import.
+            arguments: Arguments by key.
+            workers: Number of processes.
+        """
+        os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+            missing = [key for key in arguments if self.known(key) is None]
+            waiting = {pool.submit(_timed, work, arguments[key]): key for key in missing}
+            try:
+                for done in as_completed(waiting):
+                    self.add(waiting[done], done.result())
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)  # else what waits runs to its end before the error shows
+                raise
+
     def _counts(self, commit: str) -> bool:
         return self._any or (commit == self._commit and not commit.endswith("+"))
 
@@ -79,6 +100,10 @@ def timed(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     figures = measure()
     wall_s, cpu_s = time.perf_counter() - started, time.process_time() - cpu
     return {"wall_s": round(wall_s, 1), "cpu_s": round(cpu_s, 1), **figures}
+
+
+def _timed(work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]) -> dict[str, Any]:
+    return timed(lambda: work(*arguments))
 
 
 def commit_of_tree() -> str:

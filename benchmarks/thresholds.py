@@ -16,13 +16,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import multiprocessing
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +37,7 @@ from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.schemas import CgwmError
 from diagnose import base_settings
 from hidden_effects import Case, cases, make_capture
-from store import Store, timed
+from store import Store
 from thresholds_page import groups
 
 GROUPS = {"sliding": "sliding", "impact": "impact", "friction_consistency": "friction", "segments": "segments"}
@@ -229,23 +226,15 @@ def main() -> int:
     parser.add_argument("--any-commit", action="store_true", help="take up statistics of other commits, too")
     parser.add_argument("--table", action="store_true", help="print the table of what is stored, and measure nothing")
     given = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
     chosen = [case for case in cases("development", given.seeds, given.captures) if given.only in case.name]
     store, started = Store("thresholds", given.store, given.any_commit), time.monotonic()
     if not given.table:
-        todo = [case for case in chosen if store.known(case.name) is None]
-        with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            waiting = {pool.submit(_timed, case): case.name for case in todo}
-            for future in as_completed(waiting):
-                store.add(waiting[future], future.result())
+        todo = {case.name: (case,) for case in chosen if store.known(case.name) is None}
+        store.fill(measure, todo, given.workers)
         print(f"{len(todo)} captures in {time.monotonic() - started:.0f} s\n")
     names = {case.name for case in chosen}
     print(table([row for row in store.results() if row["key"] in names]))
     return 0
-
-
-def _timed(case: Case) -> dict[str, Any]:
-    return timed(lambda: measure(case))
 
 
 if __name__ == "__main__":
