@@ -30,7 +30,7 @@ from ..runtime.resources import enough_memory, one_torch_thread
 from ..segments.group_parameters import group_parameters, with_known_groups
 from ..segments.random_effects import with_fitted_groups
 from ..segments.release_detection import from_releases
-from ..trajectories.track_noise import Noise, estimate_noise
+from ..trajectories.track_noise import Noise, noise_of
 from .episode_errors import episode_errors, video_mean, within
 from .image_errors import VideoComparison, VideoErrors
 from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, EpisodePrediction, predict
@@ -261,11 +261,8 @@ def _noise(model: Model, capture: Capture, episodes: Sequence[Episode]) -> Noise
     known, given = model.file.measurement_std, capture.manifest.measurement
     position = known.get("position_m") or given.position_std_m
     rotation = known.get("rotation_rad") or given.rotation_std_rad
-    if position and rotation:
-        return Noise(position, rotation)
     free = model.file.tracked
-    estimated = estimate_noise([tracks[name] for _, tracks in episodes for name in free])
-    return Noise(position or estimated.position_m, rotation or estimated.rotation_rad)
+    return noise_of((position, rotation), (tracks[name] for _, tracks in episodes for name in free))
 
 
 @one_torch_thread()

@@ -20,7 +20,7 @@ from ..physics.chain import Chain
 from ..physics.world import Body, World
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import cut_episodes, size_of, whole_episodes
-from ..trajectories.track_noise import Noise, estimate_noise
+from ..trajectories.track_noise import noise_of
 
 
 def as_one_body(
@@ -40,7 +40,10 @@ def as_one_body(
     chain = _only_chain(world, place)
     links = [world.bodies[world.body_names.index(name)] for name in chain.links]
     whole = whole_episodes(world, episodes)
-    flights, _, _ = cut_episodes(world, whole, _rough_noise(world, episodes, given))
+    names = [world.bodies[k].name for k in world.tracked]
+    # by which frames count as clear of the ground
+    rough = noise_of(given, [tracks[name] for _, tracks in episodes for name in names if name in tracks])
+    flights, _, _ = cut_episodes(world, whole, rough)
     flying = torch.zeros_like(whole.seen[..., 0], dtype=torch.bool)
     for item in flights:
         flying[item.episode, item.first : item.last + 1] = True
@@ -74,13 +77,6 @@ def _only_chain(world: World, place: str) -> Chain:
             "use 'cgwm compare', which shows in which phase of the motion, and at which link, predictions miss.",
         )
     return chain
-
-
-def _rough_noise(world: World, episodes: Sequence[Episode], given: tuple[float | None, float | None]) -> Noise:
-    """Return standard deviations of the links' tracks, by which frames count as clear of the ground."""
-    names = [world.bodies[k].name for k in world.tracked]
-    rough = estimate_noise([tracks[name] for _, tracks in episodes for name in names if name in tracks])
-    return Noise(given[0] or rough[0], given[1] or rough[1])
 
 
 def _center_of_mass(world: World, whole: Observations, links: Sequence[Body]) -> tuple[Tensor, Tensor]:

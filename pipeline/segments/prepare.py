@@ -19,7 +19,7 @@ from ..trajectories.flight_noise import flight_noise, slow_noise, without_outlie
 from ..trajectories.innovations import WHITE, NoiseModel
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, supported_frames, whole_episodes
-from ..trajectories.track_noise import Noise, estimate_noise
+from ..trajectories.track_noise import Noise, noise_of
 from .carried_starts import carried_starts
 from .contact_phases import is_round
 from .release_detection import held_starts, release_warnings, without_held
@@ -217,8 +217,7 @@ class _State:
     ) -> _State:
         """Return the episodes from their releases on with a rough estimate of their noise, not yet cut."""
         free = [world.bodies[k].name for k in world.tracked]
-        rough = estimate_noise([tracks[name] for _, tracks in episodes for name in free if name in tracks])
-        noise = Noise(given[0] or rough[0], given[1] or rough[1])
+        noise = noise_of(given, [tracks[name] for _, tracks in episodes for name in free if name in tracks])
         every = whole_episodes(world, episodes)
         held = {} if world.chains else carried_starts(world, every, noise)
         whole = without_held(every, held)

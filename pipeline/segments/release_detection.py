@@ -20,10 +20,9 @@ import torch
 from torch import Tensor
 
 from ...datasets.capture.tracks import Episode
-from ...pipeline.trajectories.track_noise import Noise
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, whole_episodes
-from ..trajectories.track_noise import estimate_noise
+from ..trajectories.track_noise import noise_of
 from .carried_starts import carried_starts
 from .segment_states import fit_states
 from .segments import Segments
@@ -79,8 +78,7 @@ def find_releases(
     """
     free = [world.bodies[k].name for k in world.free]
     found = [tracks[name] for _, tracks in episodes for name in free if name in tracks]
-    rough = estimate_noise(found)
-    std = Noise(noise[0] or rough[0], noise[1] or rough[1])
+    std = noise_of(noise, found)
     whole = whole_episodes(world, episodes)
     held = carried_starts(world, whole, std)
     freed = without_held(whole, held)

@@ -32,6 +32,19 @@ class Noise(NamedTuple):
     """Of the rotation about each axis [rad]."""
 
 
+def noise_of(given: tuple[float | None, float | None], tracks: Iterable[Track]) -> Noise:
+    """Return standard deviations of position [m] and rotation [rad]: the given ones, estimated where there are none.
+
+    Args:
+        given: Those that are known; None where one is not.
+        tracks: Of free bodies.
+    """
+    if given[0] and given[1]:
+        return Noise(given[0], given[1])
+    estimated = estimate_noise(tracks)
+    return Noise(given[0] or estimated.position_m, given[1] or estimated.rotation_rad)
+
+
 def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> Noise:
     """Return the standard deviations of position [m] and rotation [rad] for each axis.
 
