@@ -100,13 +100,7 @@ def _on_ground(view: View, normal: Array, offset_m: float) -> tuple[Array, Array
         body = (view.cover.sum(0).cpu().numpy() > 0.01).astype(np.uint8)
         free = 1 - cv2.dilate(body, np.ones((2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1), np.uint8))
     rows, columns = np.nonzero(free)
-    K, T = view.K.cpu().numpy().astype(float), view.viewmat.cpu().numpy().astype(float)
-    local = np.stack(
-        [(columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(rows))], axis=1
-    )
-    rays = local @ T[:3, :3]
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    eye = -T[:3, :3].T @ T[:3, 3]
+    rays, eye = view.rays(columns, rows), view.camera.center
     down = rays @ normal
     met = down < -_STEEPEST
     distance = (offset_m - eye @ normal) / down[met]

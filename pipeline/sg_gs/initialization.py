@@ -222,14 +222,11 @@ def _background_pixels(views: Sequence[View], rng: np.random.Generator) -> _Pixe
     rays, origins, colors = [], [], []
     for view in views:
         width, height = view.size
-        K, T = view.K.double().cpu().numpy(), view.viewmat.double().cpu().numpy()
         u, v = rng.integers(0, width, each), rng.integers(0, height, each)
         if view.cover is not None:
             free = view.cover.sum(0).cpu().numpy()[v, u] < 0.05
             u, v = u[free], v[free]
-        local = np.stack([(u + 0.5 - K[0, 2]) / K[0, 0], (v + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(u))], 1)
-        local /= np.linalg.norm(local, axis=1, keepdims=True)
-        rays.append(local @ T[:3, :3])
+        rays.append(view.rays(u, v))
         origins.append(np.tile(view.camera.center, (len(u), 1)))
         colors.append(view.image.cpu().numpy()[v, u])
     return _Pixels(np.concatenate(rays), np.concatenate(origins), np.concatenate(colors).astype(float))

@@ -61,6 +61,13 @@ class View:
         """Return width and height [px]."""
         return self.image.shape[1], self.image.shape[0]
 
+    def rays(self, columns: NDArray[np.intp], rows: NDArray[np.intp]) -> Array:
+        """Return unit vectors (n, 3), world frame, from the camera through the centres of pixels (n,)."""
+        K, T = self.K.double().cpu().numpy(), self.viewmat.double().cpu().numpy()
+        local = [(columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(rows))]
+        along = np.stack(local, 1)
+        return along / np.linalg.norm(along, axis=1, keepdims=True) @ T[:3, :3]
+
     def silhouette(self, body: int) -> Silhouette | None:
         """Return the mask of a body (index in the manifest) at the original size, or None without a mask."""
         if self.labels is None:
