@@ -80,4 +80,6 @@ def _printed(sheet: TargetSheet) -> str:
 
 
 def _use(folder: Path) -> str:
-    return f"use them: cgwm calibrate CAPTURE --intrinsics {folder / 'intrinsics.json'}"
+    from ..pipeline.calibrate.target import INTRINSICS_NAME
+
+    return f"use them: cgwm calibrate CAPTURE --intrinsics {folder / INTRINSICS_NAME}"

@@ -9,6 +9,7 @@ from pydantic import Field
 from .base import FileModel
 from .cameras import CameraIntrinsics
 
+INTRINSICS_FORMAT = "cgwm-intrinsics/1"
 Deviation = Annotated[float, Field(ge=0, le=1e9)]
 
 
@@ -26,7 +27,7 @@ class TargetPhoto(FileModel):
 class IntrinsicsFile(FileModel):
     """`intrinsics.json`."""
 
-    format: Literal["cgwm-intrinsics/1"] = "cgwm-intrinsics/1"
+    format: Literal["cgwm-intrinsics/1"] = INTRINSICS_FORMAT
     camera: CameraIntrinsics
     fx_std_px: Deviation
     """Standard deviation of fx [px], from the corners' scatter; those below likewise."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from ...datasets.capture.capture import Capture
 from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, IntrinsicsFile, parse
 from ...schemas.documents import parse_json
+from ...schemas.intrinsics import INTRINSICS_FORMAT
 from ...schemas.regular_files import read_text_file
 
 Size = tuple[int, int]
@@ -20,7 +21,7 @@ def read_intrinsics(path: Path) -> tuple[CameraIntrinsics, ...]:
     """
     text = read_text_file(path)
     data = parse_json(text, path)
-    if isinstance(data, dict) and data.get("format") == "cgwm-intrinsics/1":
+    if isinstance(data, dict) and data.get("format") == INTRINSICS_FORMAT:
         found: tuple[CameraIntrinsics, ...] = (parse(data, IntrinsicsFile, path, text).camera,)
     else:
         file = parse(data, CamerasFile, path, text)

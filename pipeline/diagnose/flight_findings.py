@@ -249,10 +249,8 @@ class _Search:
         found = completed(beside.prepared, chosen, self.candidates, scatter, errors)
         prepared, quick = beside.prepared.with_own(found.world), self.prepared.with_own(found.world)
         tested = judged(prepared, found, scatter, slow, own_law is not None)
-        found, changed = (
-            tested.selection.with_scatter(prepared.groups, scatter),
-            tested.selection.world is not self.world,
-        )
+        found = tested.selection.with_scatter(prepared.groups, scatter)
+        changed = found.world is not self.world
         left, share = _left(quick, self.world, found.world, changed)
         return FlightFindings(
             prepared=prepared,

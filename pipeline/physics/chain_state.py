@@ -35,13 +35,7 @@ def require_chains(world: World) -> None:
     for name, body in bodies.items():
         if body.motion == "link" and name not in owner:
             raise InputDataError(f"{world.called(f'body {name!r}')} is a link of no chain.", todo="add it to a chain.")
-    if world.chains:
-        _require_known_to_chains(world)
-
-
-def _require_known_to_chains(world: World) -> None:
-    """Refuse a contact law and effects that do not act on links."""
-    if world.contact.name != "closed_form":
+    if world.chains and world.contact.name != "closed_form":
         raise UsageError("the published contact law does not know jointed bodies.", "the contact law closed_form.")
 
 
