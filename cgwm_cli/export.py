@@ -21,13 +21,13 @@ def export(
     emit: Emit,
     thing: Annotated[Path, typer.Argument(metavar="THING", help="A dataset or a model.", show_default=False)],
     to: Annotated[
-        Literal["lerobot", "bop", "nerfstudio", "rerun", "mjcf", "urdf", "usd", "ply", "colmap", "glb", "mesh"],
+        Literal["lerobot", "bop", "nerfstudio", "rerun", "mjcf", "urdf", "sdf", "usd", "ply", "colmap", "glb", "mesh"],
         typer.Option(
             "--to",
             metavar="FORMAT",
             help="For a dataset: lerobot (v3), bop (scenewise), nerfstudio (transforms.json of one rollout), "
             "rerun (.rrd of one rollout). "
-            "For a model: mjcf, urdf, usd (with physics), ply (3D Gaussian splatting), colmap, "
+            "For a model: mjcf, urdf, sdf (Gazebo, Drake), usd (with physics), ply (3D Gaussian splatting), colmap, "
             "glb (KHR_gaussian_splatting), mesh (triangles with colours, .glb).",
             show_default=False,
         ),
@@ -90,7 +90,7 @@ def export(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option("--seed", min=0, help="mjcf, urdf, usd: seed of what is compared (0).", show_default=False),
+        typer.Option("--seed", min=0, help="mjcf, urdf, sdf, usd: seed of what is compared (0).", show_default=False),
     ] = None,
     duration: Annotated[
         float | None,

@@ -6,7 +6,9 @@ from typing import Literal
 
 from .base import FileModel
 
-ExportFormat = Literal["lerobot", "bop", "nerfstudio", "rerun", "mjcf", "urdf", "usd", "ply", "colmap", "glb", "mesh"]
+ExportFormat = Literal[
+    "lerobot", "bop", "nerfstudio", "rerun", "mjcf", "urdf", "sdf", "usd", "ply", "colmap", "glb", "mesh",
+]  # fmt: skip
 
 
 class ExportResult(FileModel):

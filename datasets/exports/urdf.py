@@ -18,10 +18,18 @@ from ...schemas import ArticulationModel, BodyModel, InputDataError, JointModel
 from ...schemas.surfaces import Surface
 from ..io.atomic import new_directory
 from ..models.model import Model
-from ..shapes.meshes import Mesh
-from ..shapes.surfaces import obj_text
 from ..shapes.turns import matrix_of, quat_of_normal
 from .bop_models import ObjectModel
+from .robot_parts import (
+    HALF_SPACE_M,
+    SHEET_M,
+    mean_color,
+    moments_of,
+    numbers_text,
+    roll_pitch_yaw,
+    spheres_of,
+    write_meshes,
+)
 
 Array = NDArray[np.float64]
 
@@ -31,8 +39,6 @@ FAR = 1e4
 """Limit of a joint that has one on the other side alone [rad or m]; URDF gives both or none."""
 FAST = 1e3
 """Largest rate of a joint, which URDF requires [rad/s or m/s]: of no joint of a model it is known."""
-HALF_SPACE_M, SHEET_M = 10.0, 0.001
-"""Half the sides of the box that stands for a half space, and half the thickness of one that stands for a sheet [m]."""
 
 
 def write_urdf(
@@ -62,13 +68,7 @@ def write_urdf(
     """
     robots = robots_of(model)
     with new_directory(path, "URDF folder", overwrite) as folder:
-        (folder / "meshes").mkdir()
-        for name, mesh in meshes.items():
-            (folder / "meshes" / f"{name}.obj").write_text(obj_text(Mesh(mesh.vertices, mesh.faces)), encoding="utf-8")
-        for surface in model.file.surfaces:
-            found = model.surface_meshes.get(surface.name)
-            if found is not None:
-                (folder / "meshes" / f"{surface.name}.obj").write_text(obj_text(found), encoding="utf-8")
+        write_meshes(folder, model, meshes)
         links = 0
         for name in robots:
             root = urdf_of(model, name, meshes)
@@ -144,25 +144,19 @@ def _hang(root: ET.Element, body: BodyModel) -> None:
 def _link(model: Model, body: BodyModel, meshes: Mapping[str, ObjectModel]) -> ET.Element:
     link = ET.Element("link", name=body.name)
     inertial = ET.SubElement(link, "inertial")
-    ET.SubElement(inertial, "origin", xyz=_text(body.com_m), rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=_text([body.mass_kg]))
-    xx, yy, zz, xy, xz, yz = body.inertia_kg_m2
-    moments = {"ixx": xx, "ixy": xy, "ixz": xz, "iyy": yy, "iyz": yz, "izz": zz}
-    ET.SubElement(inertial, "inertia", {key: _text([value]) for key, value in moments.items()})
+    ET.SubElement(inertial, "origin", xyz=numbers_text(body.com_m), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=numbers_text([body.mass_kg]))
+    ET.SubElement(inertial, "inertia", moments_of(body))
     mesh = meshes.get(body.name)
     if mesh is not None:
         visual = ET.SubElement(link, "visual")
         ET.SubElement(ET.SubElement(visual, "geometry"), "mesh", filename=f"meshes/{body.name}.obj")
-        color = np.asarray(mesh.colors, float).mean(0) / 255
         material = ET.SubElement(visual, "material", name=f"{body.name}_color")
-        ET.SubElement(material, "color", rgba=_text([*color, 1.0]))
-    spheres = model.collision.get(body.name)
-    if spheres is not None:
-        radii = np.asarray(spheres.scales, float) * body.radius_factor
-        for center, radius in zip(np.asarray(spheres.means, float), radii, strict=True):
-            collision = ET.SubElement(link, "collision")
-            ET.SubElement(collision, "origin", xyz=_text(center), rpy="0 0 0")
-            ET.SubElement(ET.SubElement(collision, "geometry"), "sphere", radius=_text([radius]))
+        ET.SubElement(material, "color", rgba=mean_color(mesh))
+    for center, radius in spheres_of(model, body):
+        collision = ET.SubElement(link, "collision")
+        ET.SubElement(collision, "origin", xyz=numbers_text(center), rpy="0 0 0")
+        ET.SubElement(ET.SubElement(collision, "geometry"), "sphere", radius=numbers_text([radius]))
     return link
 
 
@@ -177,14 +171,14 @@ def _joint(joint: JointModel) -> ET.Element:
     if joint.kind == "fixed":
         return made
     axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
-    ET.SubElement(made, "axis", xyz=_text(axis))
-    ET.SubElement(made, "dynamics", damping=_text([joint.damping]), friction=_text([joint.friction]))
+    ET.SubElement(made, "axis", xyz=numbers_text(axis))
+    ET.SubElement(made, "dynamics", damping=numbers_text([joint.damping]), friction=numbers_text([joint.friction]))
     effort = joint.torque_limit if joint.torque_limit is not None else (FAR if joint.stiffness > 0 else 0.0)
-    limits = {"effort": _text([effort]), "velocity": _text([FAST])}
+    limits = {"effort": numbers_text([effort]), "velocity": numbers_text([FAST])}
     if kinds[joint.kind] != "continuous":
         limits |= {
-            "lower": _text([-FAR if lower is None else lower]),
-            "upper": _text([FAR if upper is None else upper]),
+            "lower": numbers_text([-FAR if lower is None else lower]),
+            "upper": numbers_text([FAR if upper is None else upper]),
         }
     ET.SubElement(made, "limit", limits)
     return made
@@ -197,7 +191,7 @@ def _add_scene(root: ET.Element, model: Model) -> None:
     if ground is not None:
         normal = np.asarray(ground.normal)
         place = normal * (ground.offset_m - HALF_SPACE_M)
-        _add_shape(link, "box", {"size": _text([2 * HALF_SPACE_M] * 3)}, place, quat_of_normal(normal))
+        _add_shape(link, "box", {"size": numbers_text([2 * HALF_SPACE_M] * 3)}, place, quat_of_normal(normal))
     for surface in model.file.surfaces:
         place, quat = np.asarray(surface.pose.position_m), np.asarray(surface.pose.quat_wxyz)
         tag, values, below = _shape(surface, surface.name in model.surface_meshes)
@@ -209,13 +203,17 @@ def _shape(surface: Surface, meshed: bool) -> tuple[str, dict[str, str], float]:
     if meshed:
         return "mesh", {"filename": f"meshes/{surface.name}.obj"}, 0.0
     if surface.box is not None:
-        return "box", {"size": _text(2 * np.asarray(surface.box.half_extents_m))}, 0.0
+        return "box", {"size": numbers_text(2 * np.asarray(surface.box.half_extents_m))}, 0.0
     if surface.cylinder is not None:
         shape = surface.cylinder
-        return "cylinder", {"radius": _text([shape.radius_m]), "length": _text([2 * shape.half_length_m])}, 0.0
+        return (
+            "cylinder",
+            {"radius": numbers_text([shape.radius_m]), "length": numbers_text([2 * shape.half_length_m])},
+            0.0,
+        )
     if surface.rectangle is not None:
-        return "box", {"size": _text([2 * x for x in (*surface.rectangle.half_extents_m, SHEET_M)])}, 0.0
-    return "box", {"size": _text([2 * HALF_SPACE_M] * 3)}, HALF_SPACE_M
+        return "box", {"size": numbers_text([2 * x for x in (*surface.rectangle.half_extents_m, SHEET_M)])}, 0.0
+    return "box", {"size": numbers_text([2 * HALF_SPACE_M] * 3)}, HALF_SPACE_M
 
 
 def _add_shape(link: ET.Element, tag: str, values: dict[str, str], place: Array, quat: Array) -> None:
@@ -226,16 +224,4 @@ def _add_shape(link: ET.Element, tag: str, values: dict[str, str], place: Array,
 
 
 def _origin(parent: ET.Element, place: Array, quat: Array) -> None:
-    ET.SubElement(parent, "origin", xyz=_text(place), rpy=_text(roll_pitch_yaw(matrix_of(quat))))
-
-
-def roll_pitch_yaw(matrix: Array) -> Array:
-    """Return roll, pitch and yaw (3,) [rad] about the fixed axes x, y, z of a rotation matrix (3, 3)."""
-    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
-    if np.hypot(matrix[0, 0], matrix[1, 0]) < 1e-9:  # straight up or down: roll and yaw are about the same axis
-        return np.array([np.arctan2(-matrix[1, 2], matrix[1, 1]), pitch, 0.0])
-    return np.array([np.arctan2(matrix[2, 1], matrix[2, 2]), pitch, np.arctan2(matrix[1, 0], matrix[0, 0])])
-
-
-def _text(values: object) -> str:
-    return " ".join(f"{value:.12g}" for value in np.asarray(values, float).ravel())
+    ET.SubElement(parent, "origin", xyz=numbers_text(place), rpy=numbers_text(roll_pitch_yaw(matrix_of(quat))))

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from ...schemas import ArticulationModel, BodyModel, ContactParameters, InputDataError, JointModel, UsageError
 from ...schemas.surfaces import Surface
 from ..models.model import Model
-from ..shapes.turns import matrix_of, quat_of_matrix, quat_of_normal, quat_product
+from ..shapes.turns import quat_of_matrix, quat_of_normal, quat_product
 from .bop_models import ObjectModel
+from .robot_parts import link_poses
 
 Array = NDArray[np.float64]
 
@@ -319,17 +320,6 @@ class _Writer:
     def _quatf(self, quat: Array) -> Any:
         w, x, y, z = map(float, quat / np.linalg.norm(quat))
         return self.gf.Quatf(w, self.gf.Vec3f(x, y, z))
-
-
-def link_poses(model: Model, one: ArticulationModel) -> dict[str, tuple[Array, Array]]:
-    """Return position [m] and quaternion of each link with the root as in the photos and all joints at 0, by name."""
-    pose = model.body(one.root).photo_pose
-    found = {one.root: (np.asarray(pose.position_m, float), np.asarray(pose.quat_wxyz, float))}
-    for joint in one.joints:
-        place, quat = found[joint.parent]
-        offset = matrix_of(quat) @ np.asarray(joint.position_m, float)
-        found[joint.link] = (place + offset, quat_product(quat, np.asarray(joint.quat_wxyz, float)))
-    return found
 
 
 def _turn_x_to(axis: Array) -> Array:

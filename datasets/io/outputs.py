@@ -32,7 +32,7 @@ _HEAD_BYTES = 1 << 12
 
 DirectoryKind = Literal[
     "model", "dataset", "capture", "demo", "ladder", "run", "LeRobot dataset", "BOP dataset", "nerfstudio capture",
-    "COLMAP model", "splat folder", "URDF folder",
+    "COLMAP model", "splat folder", "URDF folder", "SDF folder",
 ]  # fmt: skip
 FileKind = Literal[
     "page", "MJCF file", "USD file", "glTF file", "splat file", "index", "effect", "effect template", "calibration",

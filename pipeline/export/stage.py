@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -19,6 +20,7 @@ from ...datasets.exports.lerobot import write_lerobot
 from ...datasets.exports.mesh_glb import write_mesh_glb
 from ...datasets.exports.nerfstudio import MaskUse, place_of, write_nerfstudio
 from ...datasets.exports.rerun_log import require_rerun, write_rerun
+from ...datasets.exports.sdf import write_sdf
 from ...datasets.exports.selection import Selection
 from ...datasets.exports.splat_files import in_world, write_splat_files
 from ...datasets.exports.urdf import write_urdf
@@ -34,7 +36,7 @@ from ...schemas.quantities import MOST_DURATION_S
 from .soundness import require_sound, require_sound_files
 
 DATASET_FORMATS: tuple[ExportFormat, ...] = ("lerobot", "bop", "nerfstudio", "rerun")
-MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "urdf", "usd", "ply", "colmap", "glb", "mesh")
+MODEL_FORMATS: tuple[ExportFormat, ...] = ("mjcf", "urdf", "sdf", "usd", "ply", "colmap", "glb", "mesh")
 SUFFIXES: dict[ExportFormat, str] = {"mjcf": ".xml", "usd": ".usda", "glb": ".glb", "mesh": ".glb", "rerun": ".rrd"}
 """Suffixes of the formats that are single files."""
 LEAST_DURATION_S = 0.02
@@ -54,6 +56,9 @@ MESH_NOTE = "the meshes are the surfaces of the collision spheres, in the colour
 NO_TURNING = "in the .ply and .glb the bodies keep the light of the photos, whatever their orientation"
 NO_START = "the model has jointed bodies: the MJCF has no start, and no motion of it was compared, only places of links"
 URDF_NOTE = "a URDF has no contact law and no pose of what moves freely; each body and each jointed body has a file"
+SDF_NOTE = (
+    "SDF has friction and restitution of collisions, which simulators combine each in its way, but no contact time"
+)
 USD_NOTE = "USD has friction and restitution of materials, but no contact time: simulators choose their own stiffness"
 SOFT_FRICTION = (
     "friction in MuJoCo is softer than Coulomb's law: slip decays within one contact time; thrown cubes were 4 to 10 "
@@ -99,6 +104,7 @@ OPTIONS: dict[ExportFormat, tuple[str, ...]] = {
     "rerun": ("rollout", "cameras", "every"),
     "mjcf": ("seed", "duration_s"),
     "urdf": ("seed",),
+    "sdf": ("seed",),
     "usd": ("seed",),
     "ply": ("sh_degree",),
     "colmap": ("capture",),
@@ -116,6 +122,7 @@ _KINDS: dict[ExportFormat, DirectoryKind | FileKind] = {
     "rerun": "Rerun recording",
     "mjcf": "MJCF file",
     "urdf": "URDF folder",
+    "sdf": "SDF folder",
     "usd": "USD file",
     "ply": "splat file",
     "colmap": "COLMAP model",
@@ -132,7 +139,8 @@ def export(
     """Write a dataset or a model in another format.
 
     Args:
-        thing: DATASET for lerobot, bop, nerfstudio and rerun; MODEL for mjcf, urdf, usd, ply, colmap, glb and mesh.
+        thing: DATASET for lerobot, bop, nerfstudio and rerun; MODEL for mjcf, urdf, sdf, usd, ply, colmap, glb
+            and mesh.
         format_: The format.
         out: The file (.xml, .usda, .glb, .ply, .rrd) or directory to write; it appears once it is complete.
         options: Options of the format.
@@ -240,11 +248,23 @@ def _urdf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tu
         facts["deviation_of_links_mm"], facts["deviation_of_links_deg"] = urdf_deviation(model, folder, options.seed)
 
     counts = write_urdf(out, model, _surfaces_of_bodies(model), check, overwrite)
-    notes = [URDF_NOTE, *_left_out(model, "URDF")]
-    if any(one.servos for one in model.file.articulations):
-        notes.append("gains of servos are not in the URDF, their torque limits are (effort)")
-    if any(joint.armature for one in model.file.articulations for joint in one.joints):
-        notes.append("the reflected inertia of joints (armature) is not in the URDF")
+    return {**counts, **facts}, [URDF_NOTE, *_left_out(model, "URDF"), *_lost_of_joints(model, "URDF")]
+
+
+def _sdf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
+    from .sdf_check import sdf_deviation
+    from .usd_check import restitutions
+
+    model = _simulated(thing)
+    facts: Facts = {}
+
+    def check(root: ET.Element) -> None:
+        facts["deviation_of_links_mm"], facts["deviation_of_links_deg"] = sdf_deviation(model, root, options.seed)
+
+    counts = write_sdf(out, model, _surfaces_of_bodies(model), restitutions(model), check, overwrite)
+    notes = [SDF_NOTE, *_left_out(model, "SDF"), *_mixed_pairs(model, "SDF"), *_lost_of_joints(model, "SDF")]
+    if any(body.motion == "driven" for body in model.file.bodies):
+        notes.append("driven bodies are kinematic: what moves them is not in the SDF")
     return {**counts, **facts}, notes
 
 
@@ -257,9 +277,7 @@ def _usd(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tup
     away_mm, away_deg = usd_deviation(model, text, options.seed)
     with new_file(out, "USD file", overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    notes = [USD_NOTE, *_left_out(model, "USD")]
-    if any(pair.materials[0] != pair.materials[1] for pair in model.file.pairs):
-        notes.append("friction of pairs of different materials is not in the USD, which combines that of single ones")
+    notes = [USD_NOTE, *_left_out(model, "USD"), *_mixed_pairs(model, "USD")]
     if any(joint.friction or joint.armature for one in model.file.articulations for joint in one.joints):
         notes.append("dry friction and reflected inertia of joints are not in the USD")
     return {**counts, "deviation_of_links_mm": away_mm, "deviation_of_links_deg": away_deg}, notes
@@ -267,6 +285,21 @@ def _usd(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tup
 
 def _left_out(model: Model, name: str) -> list[str]:
     return [f"the effect {effect.name} is not in the {name}" for effect in model.file.effects]
+
+
+def _mixed_pairs(model: Model, name: str) -> list[str]:
+    if all(pair.materials[0] == pair.materials[1] for pair in model.file.pairs):
+        return []
+    return [f"friction of pairs of different materials is not in the {name}, which combines that of single ones"]
+
+
+def _lost_of_joints(model: Model, name: str) -> list[str]:
+    notes = []
+    if any(one.servos for one in model.file.articulations):
+        notes.append(f"gains of servos are not in the {name}, their torque limits are (effort)")
+    if any(joint.armature for one in model.file.articulations for joint in one.joints):
+        notes.append(f"the reflected inertia of joints (armature) is not in the {name}")
+    return notes
 
 
 def _surfaces_of_bodies(model: Model) -> dict[str, ObjectModel]:
@@ -371,6 +404,7 @@ _WORK: dict[ExportFormat, Callable[[Path, Path, ExportOptions, bool], tuple[Fact
     "rerun": _rerun,
     "mjcf": _mjcf,
     "urdf": _urdf,
+    "sdf": _sdf,
     "usd": _usd,
     "ply": _ply,
     "colmap": _colmap,

@@ -285,6 +285,7 @@ OPTIONS = (
     ("model", "export model --to smell --out OUT"),
     ("model", "export model --to usd --out OUT"),
     ("model", "export model --to urdf --out OUT --duration 0.1"),
+    ("model", "export model --to sdf --out OUT --duration 0.1"),
     ("model", "export model --to bop --out OUT"),
     ("dataset", "export dataset --to bop --out OUT --cameras nothing"),
     ("dataset", "export dataset --to nerfstudio --out OUT --rollout 99"),

@@ -105,6 +105,7 @@ ON_MODELS = (
     command("synthesize model --out OUT", *SYNTHESIZE),
     command("export model --to mjcf --out OUT.xml --duration 0.1", weight=0.5),
     command("export model --to urdf --out OUT", weight=0.3),
+    command("export model --to sdf --out OUT", weight=0.3),
     command("export model --to usd --out OUT.usda", weight=0.3),
     command("export model --to mesh --out OUT.glb", weight=0.3),
     command("export model --to ply --out OUT", weight=0.5),

@@ -148,6 +148,11 @@ def _urdf(folder: Path) -> Command:
     return Command(words=["export", str(model), "--to", "urdf", "--out", str(folder / "out")], out=("out",))
 
 
+def _sdf(folder: Path) -> Command:
+    model = write_small_model(folder / "model")
+    return Command(words=["export", str(model), "--to", "sdf", "--out", str(folder / "out")], out=("out",))
+
+
 def _usd(folder: Path) -> Command:
     model = write_small_model(folder / "model")
     return Command(words=["export", str(model), "--to", "usd", "--out", str(folder / "out.usda")], out=("out.usda",))
@@ -206,6 +211,7 @@ CASES: dict[str, Callable[[Path], Command]] = {
     "export mjcf": _mjcf,
     "export mjcf --overwrite": _replacing(_mjcf, "--seed", "5"),
     "export urdf": _urdf,
+    "export sdf": _sdf,
     "export usd": _usd,
     "import csv": _import,
     "import video": _import_video,

@@ -24,8 +24,9 @@ from cgwm.datasets.rollouts.loader import RolloutReader
 from cgwm.pipeline.control import control
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import SynthesizeConfig, task_toml
+from helpers.jointed_model import HEIGHT_M, jointed_model
 from helpers.pushing import push_task, pushed_model
-from helpers.small_model import write_small_model
+from helpers.small_model import MASS, write_small_model
 
 READERS = Path(__file__).with_name("readers")
 CPU_WHEELS = "https://download.pytorch.org/whl/cpu"
@@ -242,6 +243,18 @@ def test_two_gltf_readers_read_the_export(environment: Environment, work: Path) 
     np.testing.assert_allclose(found["clouds"]["cube"]["mean"], [x, z, -y], atol=1e-6)
     x, y, z = model.scene.means.mean(0)
     np.testing.assert_allclose(found["clouds"]["scene"]["mean"], [x, z, -y], atol=1e-6)
+
+
+def test_drake_reads_the_world(environment: Environment, work: Path) -> None:
+    python = environment("drake", ("numpy", "pyyaml", "pydot", "matplotlib"), ("drake==1.51.1",))
+    write_model(work / "arm", jointed_model("fixed", (-0.5, 1.0), cube=True))
+    cgwm(work, "export", "arm", "--to", "sdf", "--out", "sdf")
+    found = read_by(python, "sdf", work, work / "sdf" / "world.sdf", 0.4)
+    assert found["gravity"] == [0, 0, -9.81] and found["actuators"] == 0
+    assert found["joints"]["elbow"] == ["RevoluteJoint", -0.5, 1.0]
+    assert found["bodies"]["cube/link"][:4] == pytest.approx([MASS, 0.3, 0, 0.05])
+    turned = [np.cos(0.4), 0, -np.sin(0.4)]  # the hinge is about y
+    assert found["bodies"]["arm/lower"] == pytest.approx([0.3, 0.1, 0, HEIGHT_M, *turned])
 
 
 def pinned(package: str) -> str:

@@ -4,14 +4,17 @@ import importlib.util
 import math
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import mujoco
 import numpy as np
 import pytest
-from cgwm.datasets.exports.urdf import roll_pitch_yaw, urdf_of
+from cgwm.datasets.exports.robot_parts import roll_pitch_yaw
+from cgwm.datasets.exports.urdf import urdf_of
 from cgwm.datasets.models.model import Model, write_model
 from cgwm.datasets.robots import read_articulation
 from cgwm.pipeline.export import export
+from cgwm.pipeline.export.sdf_check import sdf_deviation
 from cgwm.pipeline.export.urdf_check import open_urdf, urdf_deviation
 from cgwm.schemas import InputDataError, JointModel, UsageError
 from helpers.jointed_model import HEIGHT_M, RADIUS, jointed_model
@@ -92,6 +95,34 @@ def test_fixed_surfaces_are_a_scene(tmp_path: Path) -> None:
     assert {path.name for path in out.glob("*.urdf")} == {"cube.urdf", "other.urdf", "scene.urdf"}
 
 
+@pytest.mark.parametrize("base", ["free", "driven", "fixed"])
+def test_an_sdf_has_bodies_joints_and_materials(tmp_path: Path, base: str) -> None:
+    model = with_joint(jointed_model(base, cube=True), SLIDE.model_copy(update={"name": "lower", "upper": None}))
+    path = made(tmp_path, model, "sdf") / "world.sdf"
+    root = ET.parse(path).getroot()
+    assert root.findtext("world/gravity") == "0 0 -9.81"
+    assert root.findtext("world/model[@name='cube']/pose") == "0.3 0 0.05 0 0 0"
+    assert float(root.findtext("world/model[@name='cube']/link/inertial/mass", "")) == MASS
+    assert len(root.findall("world/model[@name='cube']/link/collision/geometry/sphere")) == 27
+    assert root.findtext("world/model[@name='arm']/link/collision/surface/friction/ode/mu") == "0.4"
+    slide = root.find("world/model/joint[@name='lower_joint']")  # a link has the name 'lower'
+    assert slide is not None and slide.get("type") == "prismatic"
+    limit = {one.tag: one.text for one in slide.findall("axis/limit/*")}
+    assert limit == {"lower": "-0.02", "effort": "2"}
+    held = root.find("world/model/joint[@name='upper_in_world']")
+    assert (held is not None) == (base == "fixed")
+    assert (root.find("world/model/link[@name='upper']/kinematic") is not None) == (base == "driven")
+    bent = with_joint(model, SLIDE.model_copy(update={"name": "lower", "axis": (0, 0, 1)}))
+    assert sdf_deviation(bent, root, 0)[0] > 1.0  # the check sees another axis
+    assert (path.parent / "meshes" / "cube.obj").is_file()
+
+
+def test_fixed_surfaces_and_hinges_are_in_the_sdf(tmp_path: Path) -> None:
+    still = ET.parse(made(tmp_path / "tray", in_tray(), "sdf") / "world.sdf").getroot().findall("world/model[static]")
+    assert [one.get("name") for one in still] == ["floor", "left", "right", "front", "back"]
+    made(tmp_path / "arm", jointed_model("free", LIMITS), "sdf")
+
+
 @needs_usd
 def test_a_stage_has_masses_spheres_joints_drives_and_materials(tmp_path: Path) -> None:
     from pxr import Usd, UsdGeom, UsdPhysics, UsdShade  # pyright: ignore[reportMissingImports]
@@ -151,6 +182,11 @@ def test_equal_names_and_other_suffixes_are_refused(tmp_path: Path) -> None:
     write_model(tmp_path / "model", replace(model, file=file, collision={"scene": model.collision["cube"]}))
     with pytest.raises(InputDataError, match=r"two things would be scene.urdf"):
         export(tmp_path / "model", "urdf", tmp_path / "out")
+    named = model.file.bodies[0].model_copy(update={"name": "ground"})
+    file = model.file.model_copy(update={"bodies": (named,), "parameters": model.file.parameters[:2]})
+    write_model(tmp_path / "ground", replace(model, file=file, collision={"ground": model.collision["cube"]}))
+    with pytest.raises(InputDataError, match=r"two things would be the model 'ground'"):
+        export(tmp_path / "ground", "sdf", tmp_path / "out")
     with pytest.raises(UsageError, match=r"(?s)--to usd writes one file.*a name that ends in .usda"):
         export(tmp_path / "model", "usd", tmp_path / "out.usd")
     assert not (tmp_path / "out").exists()
