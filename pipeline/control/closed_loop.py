@@ -1,8 +1,10 @@
 """Closed-loop simulation of a fitted model: each step takes a command and returns a frame and the state.
 
-On CUDA a step is one replay of a CUDA graph: the fused kernel over all sub-steps of the control interval, then the
-renderer over all spheres. On the CPU the torch engine and renderer do the same, slowly. The steps are those of one
-open-loop rollout under the same commands: the contact impulses persist from one control step to the next.
+The fused kernel runs over all sub-steps of the control interval, then the renderer over all spheres. One environment
+leaves a GPU idle, and a core of a CPU is ten times as fast at it: so physics runs on the CPU where there is a C++
+compiler, on CUDA, too, where the frame is one replay of a CUDA graph. Without a compiler CUDA runs the kernel in that
+graph, and a CPU the torch engine, slowly. The steps are those of one open-loop rollout under the same commands: the
+contact impulses persist from one control step to the next.
 """
 
 from __future__ import annotations
@@ -22,17 +24,15 @@ from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_no
 from ..physics.chain import Chain
 from ..physics.chain_state import joints_of
 from ..physics.checks import require_apart
-from ..physics.fused.stepping import FusedStepper
 from ..physics.joint_command import JointCommand
 from ..physics.kinematic import Drive
-from ..physics.stepping import Stepper, TorchStepper
 from ..physics.thin_walls import require_thick_walls
-from ..physics.world import State, World
+from ..physics.world import State
 from .frame_renderer import FrameRenderer
+from .loop_physics import SIZES, DeviceState, numbers_of, state_of, stepper_of
 
 ROOM, LEAST_ROOM = 2, 65_536
 """Capacity for pairs of tiles and spheres in the renderer's kernels: factor of the last count, and minimum number."""
-_SIZES = {"position_m": 3, "quat_wxyz": 4, "velocity_m_s": 3, "omega_body_rad_s": 3}
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class ClosedLoop:
     """A fitted model as the environment of a controller.
 
     Args:
-        model: A model with fitted physics and visual spheres; jointed bodies run on the CPU.
+        model: A model with fitted physics and visual spheres.
         camera: The camera of the frames; None for no frames, which have the shape (0, 0, 3) then.
         control_dt_s: Length of a control interval [s]; the physics divides it into sub-steps.
         device: cpu or cuda.
@@ -101,12 +101,12 @@ class ClosedLoop:
                 "ClosedLoop moves driven bodies without joints alone.",
                 'jointed bodies with base = "free" or "fixed".',
             )
-        world = World.from_model(model, dtype, device)
-        self._world, self._cuda = world, world.gravity.is_cuda
         self._times = torch.tensor([[0.0, control_dt_s]], dtype=torch.float64)
-        stepper: Stepper = (FusedStepper if self._cuda else TorchStepper)(world, control_dt_s)
-        self._stepper = stepper
-        self._picture = _NoFrames(world) if camera is None else FrameRenderer(model, camera, device)
+        self._cuda = torch.device(device).type == "cuda"
+        self._stepper, self._world = stepper_of(model, control_dt_s, device, dtype)
+        world = self._world
+        self._sent = DeviceState(world, device) if self._cuda and not world.gravity.is_cuda else None
+        self._picture = _NoFrames(device) if camera is None else FrameRenderer(model, camera, device)
         self._servos = [chain for chain in world.chains if JointCommand.needed(chain)]
         self._targets: dict[str, Tensor] = {}
         self._poses: dict[str, tuple[Tensor, Tensor]] | None = None
@@ -130,7 +130,7 @@ class ClosedLoop:
             InputDataError: If the state has another shape, is not finite, or bodies interpenetrate deeply.
         """
         world, count = self._world, len(self.body_names)
-        for name, size in _SIZES.items():
+        for name, size in SIZES.items():
             shape = tuple(getattr(state, name).shape)
             if shape != (1, count, size):
                 raise InputDataError(f"the start's {name} has the shape {shape}.", f"{(1, count, size)}.")
@@ -148,12 +148,13 @@ class ClosedLoop:
         require_thick_walls(world, start)
         self._stepper.reset(start, at_rest)
         self._poses, self._steps = poses, 0
-        frame, pairs = self._picture.of(start)
+        there = start if self._sent is None else self._sent.set(start)
+        frame, pairs = self._picture.of(there)
         if self._cuda and self._graph is None:
             capacity = _room(int(pairs))
             self._advanced(capacity)  # compiles and loads all kernels, which is impossible during a capture
             self._stepper.reset(start, at_rest)
-            self._graph = self._captured(start, capacity)
+            self._graph = self._captured(there, capacity)
         if self._cuda:
             torch.cuda.synchronize()
         return frame
@@ -180,6 +181,8 @@ class ClosedLoop:
         joints = {chain.name: given.pop(chain.name) for chain in self._servos if chain.name in given}
         drives = self._commanded(self._poses, given)
         self._stepper.command({**self._typed(drives), **self._servo_commands(joints)})
+        if self._sent is not None:
+            self._sent.set(self._stepper.advance())
         outcome = self._graph.replayed() if self._graph is not None else self._advanced(None)
         pairs, finite = outcome.checks.tolist()  # waits for the device
         self._steps += 1
@@ -255,9 +258,9 @@ class ClosedLoop:
         return velocity, quat_rotate(quat, turn) / length
 
     def _advanced(self, capacity: int | None) -> _Outcome:
-        """Advance physics and frame by one interval."""
-        state = self._stepper.advance()
-        numbers = torch.cat([getattr(state, name) for name in _SIZES], -1)
+        """Return state and frame after an interval; physics of the same device advances by it here."""
+        state = self._stepper.advance() if self._sent is None else self._sent.state
+        numbers = numbers_of(state)
         frame, pairs = self._picture.of(state, capacity)
         checks = torch.stack((pairs.to(torch.int32), torch.isfinite(numbers).all().to(torch.int32)))
         return _Outcome(frame, numbers, checks)
@@ -279,8 +282,8 @@ class ClosedLoop:
 class _NoFrames:
     """Renderer of nothing, for loops without a camera."""
 
-    def __init__(self, world: World) -> None:
-        self._frame = torch.zeros(0, 0, 3, dtype=torch.uint8, device=world.gravity.device)
+    def __init__(self, device: str) -> None:
+        self._frame = torch.zeros(0, 0, 3, dtype=torch.uint8, device=device)
 
     def of(self, state: State, capacity: int | None = None) -> tuple[Tensor, Tensor]:
         """Return an empty frame, and no pairs."""
@@ -308,7 +311,7 @@ class _Outcome:
     """Number of pairs of tiles and spheres, and whether the state is finite, shape (2,)."""
 
     def state(self) -> State:
-        return State(*self.numbers.clone().split(list(_SIZES.values()), -1))
+        return state_of(self.numbers.clone())
 
 
 @dataclass(frozen=True)

@@ -68,10 +68,11 @@ def simulate_on_host(
         InputDataError: As `simulate` does.
         UsageError: If a reverse derivative is requested.
     """
-    return roll(_launch, world, state, times_s, driven, record_contacts, lanes=1)
+    return roll(launch_on_host, world, state, times_s, driven, record_contacts, lanes=1)
 
 
-def _launch(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
+def launch_on_host(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
+    """Run the kernel of a structure on the CPU; arguments as of `launch`, tensors on the CPU."""
     pointers = [ctypes.c_void_p(None if tensor is None else tensor.data_ptr()) for tensor in tensors]
     threads = max(1, min(kernel_threads(), numbers[0] // THREAD_ROLLOUTS))
     _library(structure).run(ctypes.c_int(threads), *pointers, *(ctypes.c_int(number) for number in numbers))

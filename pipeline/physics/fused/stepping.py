@@ -14,67 +14,64 @@ from ..effects.effect import changed_by_effects
 from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..world import State, World
-from .commands import drive_rows
+from .commands import Commands
+from .host import lacking, launch_on_host
 from .launch import launch
 from .packing import Packed, pack
 from .rollout import FRAME_WIDTH, Launch, read_frames, require_one_kind, unsupported
-from .structure import BODY_COLUMNS, MOTION_COLUMNS, lanes_for
+from .structure import lanes_for
 
 
 class FusedStepper:
-    """`Stepper` that launches the fused kernel once per interval.
+    """`Stepper` that runs the fused kernel once per interval, on the device of the world.
 
     The state between steps (motions, and the contact impulses that warm-start the solver) stays in an array on the
     device, so that nothing is packed again. `advance` neither allocates outside of torch's caches nor waits for
     the device: a CUDA graph can capture it.
 
     Args:
-        world: The world, with a batch of one, on a CUDA device.
+        world: The world, with a batch of one.
         interval_s: Length of an interval [s].
-        run: Function that launches the kernel; None for `launch`.
+        run: Function that runs the kernel; None for that of the device.
+        lanes: Threads of the environment, a power of two up to 32; None for the default, one on a CPU.
 
     Raises:
         UsageError: If the kernel does not support the world.
         InputDataError: If masses, inertias, contact coefficients or the step cannot be simulated.
     """
 
-    def __init__(self, world: World, interval_s: float, run: Launch | None = None) -> None:
-        reason = unsupported(world) if run is None else None
-        if world.chains:
-            reason = "its motion from interval to interval has no place for joints"
+    def __init__(self, world: World, interval_s: float, run: Launch | None = None, lanes: int | None = None) -> None:
+        cuda = world.gravity.is_cuda
+        reason = None if run is not None else unsupported(world) if cuda else lacking(world)
         if reason is not None:
-            raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="step it on the CPU.")
+            raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="use TorchStepper, which can.")
         require_physical(world)
         self._world = changed_by_effects(world)
         if world.effects:
             require_physical(self._world)  # an effect may give a body an impossible inertia
-        self._run = run or launch
+        self._run, self._lanes = run or (launch if cuda else launch_on_host), lanes
         self._times = torch.tensor([[0.0, interval_s]], dtype=torch.float64).to(world.gravity)
-        self._driven = [body.name for body in world.bodies if body.motion == "driven"]
         self._resident: _Resident | None = None
 
     def reset(self, state: State, drives: Mapping[str, Drive | JointCommand]) -> None:
         """See :class:`Stepper`; the state has the device and type of the world, the drives are on the CPU."""
-        drives = _bodies_only(drives)
         like = self._world.gravity
         require_one_kind(like, *vars(state).values())
         require_state(state, self._world.body_names)
-        there = {name: Drive(*(x.to(like.device) for x in vars(drive).values())) for name, drive in drives.items()}
+        there = {name: _moved(drive, like.device) for name, drive in drives.items()}
         packed = pack(self._world, state, self._times, there, False)
         if self._resident is None:
-            self._resident = _Resident.of(packed)
-        motions = packed.table[:, -len(self._world.bodies) * BODY_COLUMNS :].unflatten(1, (-1, BODY_COLUMNS))
-        motions = motions[..., -MOTION_COLUMNS:].flatten(1)
+            self._resident = _Resident.of(packed, self._lanes)
+        self._resident.packed.table.copy_(packed.table)
         self._resident.carried.zero_()
-        self._resident.carried[..., : motions.shape[1]] = motions[:, None]
         self.command(drives)
 
     def command(self, drives: Mapping[str, Drive | JointCommand]) -> None:
         """See :class:`Stepper`; drives lie on the CPU, and the previous interval must have ended."""
-        drives = _bodies_only(drives)
         resident = self._started()
-        if self._driven:
-            resident.sent.copy_(torch.cat([drive_rows(drives[name], resident.turn)[0] for name in self._driven], 1))
+        if resident.sent.numel() > 0:
+            commands = Commands.of(self._world, drives, resident.sent, resident.turn)
+            resident.sent.copy_(commands.samples(1, resident.sent))
             resident.packed.drives.copy_(resident.sent, non_blocking=True)
 
     def advance(self) -> State:
@@ -97,9 +94,8 @@ class FusedStepper:
         return self._resident
 
 
-def _bodies_only(drives: Mapping[str, Drive | JointCommand]) -> dict[str, Drive]:
-    """Return the commands of driven bodies; worlds with joints are refused."""
-    return {name: drive for name, drive in drives.items() if isinstance(drive, Drive)}
+def _moved(drive: Drive | JointCommand, device: torch.device) -> Drive | JointCommand:
+    return type(drive)(*(value.to(device) for value in vars(drive).values()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,9 +114,10 @@ class _Resident:
     """State between launches, see `resume` in `kernels/environment.cuh`, shape (1, lanes, values)."""
 
     @staticmethod
-    def of(packed: Packed) -> _Resident:
-        kind, bodies = packed.structure, len(packed.structure.free)
-        lanes = lanes_for(kind.contacts, 1, kind.single, kind.dual, kind.paired)
+    def of(packed: Packed, lanes: int | None) -> _Resident:
+        kind, bodies, cuda = packed.structure, len(packed.structure.free), packed.table.is_cuda
+        if lanes is None:
+            lanes = lanes_for(kind.contacts, 1, kind.single, kind.dual, kind.paired) if cuda else 1
         structure = replace(kind, lanes=lanes, carried=True)
         arrays = {
             name: getattr(packed, name).contiguous() for name in ("table", "steps", "geometry", "surfaces", "drives")
@@ -129,7 +126,7 @@ class _Resident:
         return _Resident(
             packed=replace(packed, structure=structure, **arrays),
             turn=None if packed.turn is None else packed.turn.cpu(),
-            sent=torch.empty(drives.shape, dtype=drives.dtype, pin_memory=drives.is_cuda and drives.numel() > 0),
+            sent=torch.empty(drives.shape, dtype=drives.dtype, pin_memory=cuda and drives.numel() > 0),
             frames=drives.new_empty(1, 2, bodies, FRAME_WIDTH),
             carried=drives.new_zeros(1, lanes, structure.carried_width),
         )

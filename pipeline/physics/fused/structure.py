@@ -154,8 +154,9 @@ class Structure:
 
     @property
     def carried_width(self) -> int:
-        """Number of values that each thread keeps for the next launch: motions, impulses, and whether any acts."""
-        return len(self.free) * MOTION_COLUMNS + 3 * self.slots + 1
+        """Number of values that each thread keeps for the next launch, see `resume` in `kernels/environment.cuh`."""
+        joints = 0 if self.tree is None else len(self.tree.joint_dofs)
+        return 1 + len(self.free) * MOTION_COLUMNS + 3 * self.slots + 1 + 5 * joints
 
     @property
     def _unrolled(self) -> bool:

@@ -11,7 +11,8 @@ from cgwm.datasets.capture.cameras import Camera
 from cgwm.pipeline.control import ClosedLoop, Reach, Velocity
 from cgwm.pipeline.geometry.rotation import quat_exp
 from cgwm.pipeline.physics.engine import rollout
-from cgwm.pipeline.physics.fused.rollout import roll
+from cgwm.pipeline.physics.fused.launch import launch
+from cgwm.pipeline.physics.fused.rollout import Launch, roll
 from cgwm.pipeline.physics.fused.stepping import FusedStepper
 from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.physics.world import State, World
@@ -22,7 +23,8 @@ from helpers import fused_host
 from helpers.small_model import small_model
 
 CUDA = torch.cuda.is_available() and kernel_build.available()
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core"))]
+NEEDS_CUDA = pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core")
+DEVICES = ["cpu", pytest.param("cuda", marks=NEEDS_CUDA)]
 NEEDS_COMPILER = pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
 DT, STEPS, SPEED = 0.02, 8, 0.3
 
@@ -88,14 +90,22 @@ def test_steps_are_those_of_one_rollout_and_frames_those_of_datasets(device: str
     assert np.abs(found[0].astype(int) - found[-1]).max() > 50, "nothing moved"
 
 
-@NEEDS_COMPILER
-def test_the_kernel_goes_on_where_it_ended() -> None:
-    world, (drive, _) = World.from_model(small_model(driven=True)), pushed()
-    expected = roll(fused_host.run, world, start(), drive.times_s, {"tip": drive})
-    stepper = FusedStepper(world, DT, fused_host.run)
+@pytest.mark.parametrize(
+    ("device", "run", "lanes"),
+    [
+        pytest.param("cpu", fused_host.run, 8, marks=NEEDS_COMPILER, id="eight threads of a warp"),
+        pytest.param("cuda", None, None, marks=NEEDS_CUDA, id="cuda"),
+    ],
+)
+def test_the_kernel_goes_on_where_it_ended(device: str, run: Launch | None, lanes: int | None) -> None:
+    world, (drive, _) = World.from_model(small_model(driven=True), device=device), pushed()
+    first = State(*(value.to(device) for value in vars(start()).values()))
+    whole = Drive(*(value.to(device) for value in vars(drive).values()))
+    expected = roll(run or launch, world, first, whole.times_s, {"tip": whole}, lanes=lanes)
+    stepper = FusedStepper(world, DT, run, lanes)
     for _ in range(2):  # the second time after a reset
         pieces = [_piece(drive, k) for k in range(STEPS)]
-        stepper.reset(start(), {"tip": pieces[0]})
+        stepper.reset(first, {"tip": pieces[0]})
         for k, piece in enumerate(pieces):
             stepper.command({"tip": piece})
             state = stepper.advance()

@@ -7,11 +7,13 @@ import torch
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.control import ClosedLoop, Targets, Velocity
 from cgwm.pipeline.physics.chain_state import joints_of, with_joints
+from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.stepping import FusedStepper
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.physics.rollout import simulate
 from cgwm.pipeline.physics.world import State, World
 from cgwm.schemas import UsageError
+from helpers import fused_host
 from helpers.jointed_model import HEIGHT_M, jointed_model
 
 DT = 0.01
@@ -97,6 +99,20 @@ def test_passive_joints_have_no_targets_and_driven_roots_are_refused() -> None:
         ClosedLoop(served("driven"), None, DT)
 
 
-def test_the_gpu_stepper_says_that_it_takes_no_joints() -> None:
-    with pytest.raises(UsageError, match=r"no place for joints.\n.*step it on the CPU"):
-        FusedStepper(World.from_model(served()), DT, lambda *_: None)
+@pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
+@pytest.mark.parametrize("lanes", [1, 4])
+def test_joints_go_on_where_they_ended_and_a_reset_begins_anew(lanes: int) -> None:
+    """The arm falls onto its lower limit, whose impulse warm-starts the next interval."""
+    world = World.from_model(served())
+    chain, first, times = world.chains[0], start(world, -0.9), DT * torch.arange(7, dtype=torch.float64)
+    still = JointCommand.hold_still(torch.tensor([[-1.4]], dtype=torch.float64))
+    whole = roll(fused_host.run, world, first, times[None], {"arm": still}, lanes=lanes)
+    assert float(joints_of(world, State(*(getattr(whole, n)[:, -1] for n in vars(first))), chain)[0]) < -0.98
+    stepper = FusedStepper(world, DT, fused_host.run, lanes)
+    for _ in range(2):
+        stepper.reset(first, {"arm": still})
+        for k in range(1, len(times)):
+            stepper.command({"arm": still})
+            state = stepper.advance()
+            for name in vars(first):
+                torch.testing.assert_close(getattr(state, name), getattr(whole, name)[:, k], atol=1e-11, rtol=0)

@@ -205,10 +205,12 @@ INLINE void load(const Problem& problem, Environment& env) {
 }
 
 #if CARRIED
-// Restores the state at the end of the last launch: position, orientation, velocity and spin of each body, the impulses
-// of this lane's contacts, and whether any is not zero. Every lane has a copy, so that lanes need no synchronisation.
+// Restores the state at the end of the last launch, if there was one since the last reset: position, orientation,
+// velocity and spin of each body, the impulses of this lane's contacts, whether any is not zero, and values, speeds and
+// impulses of the joints. Every lane has a copy, so that lanes need no synchronisation.
 INLINE void resume(const Problem& problem, Environment& env) {
     const Number* row = problem.carried + (env.index * LANES + env.lanes.lane) * CARRIED_WIDTH;
+    if (*row++ == Number(0)) return;
     EACH_BODY
     for (int b = 0; b < BODIES; b++, row += 13) {
         Body& body = env.bodies[b];
@@ -220,10 +222,18 @@ INLINE void resume(const Problem& problem, Environment& env) {
     }
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) env.before[i] = vec(row[3 * i], row[3 * i + 1], row[3 * i + 2]);
-    env.warm = row[3 * SLOTS] > Number(0);
+    row += 3 * SLOTS;
+    env.warm = *row++ > Number(0);
 #if PAIRED
     for (int i = 0; i < SLOTS; i++) env.kept[i] = i;
     env.kept_count = SLOTS;
+#endif
+#if LINKS
+    for (int j = 0; j < JOINTS; j++, row += 5) {
+        env.chain.values[j] = row[0];
+        env.chain.speeds[j] = row[1];
+        for (int k = 0; k < 3; k++) env.chain.impulses[3 * j + k] = row[2 + k];
+    }
 #endif
 }
 
@@ -231,6 +241,7 @@ INLINE void resume(const Problem& problem, Environment& env) {
 INLINE void suspend(const Problem& problem, const Environment& env) {
     if (env.lanes.idle) return;
     Number* row = problem.carried + (env.index * LANES + env.lanes.lane) * CARRIED_WIDTH;
+    *row++ = Number(1);
     EACH_BODY
     for (int b = 0; b < BODIES; b++, row += 13) {
         const Body& body = env.bodies[b];
@@ -245,7 +256,15 @@ INLINE void suspend(const Problem& problem, const Environment& env) {
         row[3 * i + 1] = env.before[i].y;
         row[3 * i + 2] = env.before[i].z;
     }
-    row[3 * SLOTS] = env.warm ? Number(1) : Number(0);
+    row += 3 * SLOTS;
+    *row++ = env.warm ? Number(1) : Number(0);
+#if LINKS
+    for (int j = 0; j < JOINTS; j++, row += 5) {
+        row[0] = env.chain.values[j];
+        row[1] = env.chain.speeds[j];
+        for (int k = 0; k < 3; k++) row[2 + k] = env.chain.impulses[3 * j + k];
+    }
+#endif
 }
 #endif
 
