@@ -24,6 +24,9 @@ class CalibrateConfig(FileModel):
     """Photos are reduced to this longer side [px] for feature extraction."""
     retries: Annotated[int, Field(ge=0, le=1000)] = 4
     """Further attempts (other seeds, then more features) after a model that fails the self-check."""
+    turntable: bool | None = None
+    """Whether the camera stands and what it shows turns: features are then taken from the pixels that differ from the
+    surroundings. Left out, the photos tell it: much looks the same at the same pixels of all."""
 
 
 class SplatConfig(FileModel):

@@ -20,6 +20,7 @@ import pycolmap
 
 from ...datasets.io.progress import progress
 from .reconstruction import VerifiedPair
+from .turntable import standing_features
 
 ResultT = TypeVar("ResultT")
 
@@ -50,6 +51,9 @@ class SfmImage:
     """Name of the camera; images of one camera share their intrinsics and their size."""
     mask: Path | None = None
     """Folder of masks, `<name>.png`, 0 where features are excluded; None uses the whole images."""
+    stands: bool = False
+    """Whether the camera stands in all images, so that features at one place in many of them are of its surroundings
+    and are dropped."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +103,8 @@ def build_database(database: Path, root: Path, images: Sequence[SfmImage], setti
         settings: Settings of the attempt.
     """
     _extract(database, root, images, settings)
+    if any(image.stands for image in images):
+        _drop_standing(database)
     _match(database, [image.name for image in images], settings)
 
 
@@ -174,6 +180,29 @@ def _extract(database: Path, root: Path, images: Sequence[SfmImage], settings: S
                 )
                 bar.update(len(chunk))
     _name_cameras(database, images)
+
+
+def _drop_standing(database: Path) -> None:
+    """Drop the features that are at the same place in many images, which a standing camera sees of its surroundings."""
+    opened = pycolmap.Database.open(database)
+    try:
+        identifiers = [image.image_id for image in opened.read_all_images()]
+        keypoints = {key: opened.read_keypoints(key) for key in identifiers}
+        described = {key: opened.read_descriptors(key) for key in identifiers}
+        kept = [
+            ~standing
+            for standing in standing_features(
+                [keypoints[key][:, :2] for key in identifiers], [described[key].data for key in identifiers]
+            )
+        ]
+        opened.clear_keypoints()
+        opened.clear_descriptors()
+        for key, keep in zip(identifiers, kept, strict=True):
+            opened.write_keypoints(key, keypoints[key][keep])
+            described[key].data = described[key].data[keep]
+            opened.write_descriptors(key, described[key])
+    finally:
+        opened.close()
 
 
 def _match(database: Path, names: Sequence[str], settings: SfmSettings) -> None:

@@ -97,7 +97,7 @@ def from_known_distance(model: SfmModel, known: KnownDistance) -> MetricFrame:
     std = float(np.sqrt(direction @ (a.covariance + b.covariance) @ direction)) / length
     source = f"known distance of {known.distance_m:g} m between two marked points"
     return MetricFrame(
-        similarity=_scaling(known.distance_m / length), source=source, relative_std=std, fixes_frame=False
+        similarity=scaling(known.distance_m / length), source=source, relative_std=std, fixes_frame=False
     )
 
 
@@ -127,7 +127,7 @@ def from_camera_distance(model: SfmModel, known: KnownCameraDistance) -> MetricF
     source = f"known distance of {known.distance_m:g} m between the cameras of {known.images[0]} and {known.images[1]}"
     std = float(np.linalg.norm(stds)) / length
     return MetricFrame(
-        similarity=_scaling(known.distance_m / length), source=source, relative_std=std, fixes_frame=False
+        similarity=scaling(known.distance_m / length), source=source, relative_std=std, fixes_frame=False
     )
 
 
@@ -245,7 +245,8 @@ def _marked_point(model: SfmModel, pixels: Mapping[str, tuple[float, float]], fi
     return point
 
 
-def _scaling(scale: float) -> Similarity:
+def scaling(scale: float) -> Similarity:
+    """Return the change of the unit of length alone."""
     return Similarity(scale, np.eye(3), np.zeros(3))
 
 

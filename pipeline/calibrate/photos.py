@@ -7,7 +7,7 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping as Map
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.exif import photo_lens
 from ...datasets.capture.images import image_size, write_image
-from ...schemas import CameraIntrinsics
+from ...datasets.io.progress import progress
+from ...schemas import CameraIntrinsics, InputDataError
 from .colmap import SfmImage
 from .given_intrinsics import known_by_size
+from .turntable import camera_stands, probes, reduced, surroundings, turning
 
 STILL_BELOW_PX = 2.0
 """Threshold on the median displacement of the background per 1000 px of image width [px], for a static camera."""
@@ -62,16 +64,21 @@ def video_label(camera: str) -> str:
     return f"video:{camera}"
 
 
-def gather(capture: Capture, folder: Path, intrinsics: Path | None = None) -> Inputs:
+def gather(capture: Capture, folder: Path, intrinsics: Path | None = None, turntable: bool | None = None) -> Inputs:
     """Collect the images of a capture in a working folder, under names that COLMAP can read.
 
     Args:
         capture: The capture.
         folder: An empty folder, kept for the duration of the calibration.
         intrinsics: File of known intrinsics besides those of the manifest.
+        turntable: Whether the camera stands and what it shows turns, so that the surroundings are left out; None looks
+            at the photos.
     """
     root = folder / "images"
     sources, notes, richest = _photos(capture, root)
+    if turntable or (turntable is None and _turns(capture)):
+        sources, note = _without_surroundings(capture, folder, sources)
+        notes.append(note)
     moving: dict[str, str] = {}
     for camera in capture.video_cameras():
         frames, masks = _probe_frames(capture, camera)
@@ -150,6 +157,50 @@ def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str], dict
             "photos with one focal length are calibrated best"
         )
     return sources, notes, richest
+
+
+def _turns(capture: Capture) -> bool:
+    return camera_stands([reduced(capture.photo(name)) for name in probes(capture.photos())])
+
+
+def _without_surroundings(capture: Capture, folder: Path, sources: list[Source]) -> tuple[list[Source], str]:
+    """Write masks that leave out the surroundings, which stand; return the sources with them, and a note.
+
+    What `masks/` shows of bodies is kept, too.
+    """
+    small = [reduced(capture.photo(source.label)) for source in sources]
+    sizes = {photo.shape for photo in small}
+    if len(sizes) > 1:
+        raise InputDataError(
+            f"{capture.root / 'images'}: photos of {len(sizes)} sizes, of a camera that stands.",
+            "photos of one size, from which the surroundings that stand can be told.",
+            "leave out photos of other sizes, or --set calibrate.turntable=false.",
+        )
+    color, known = surroundings(small)
+    shares = []
+    for source, photo in zip(progress(sources, "surroundings", unit="image"), small, strict=True):
+        width, height = image_size(capture.root / "images" / source.label)
+        small_mask = turning(photo, color, known).astype(np.uint8)
+        keep = np.asarray(cv2.resize(small_mask, (width, height), interpolation=cv2.INTER_NEAREST), bool)
+        given = capture.photo_mask(source.label)
+        if given is not None and given.shape == keep.shape:
+            keep = keep | (given > 0)
+        path = folder / "masks" / f"{source.image.name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(path, np.where(keep, 255, 0).astype(np.uint8))
+        shares.append(float(keep.mean()))
+    if not any(shares):
+        raise InputDataError(
+            f"{capture.root / 'images'}: all photos are the same: the camera stands, and nothing moves.",
+            "photos from many sides.",
+            "move the camera, or turn the object, between photos.",
+        )
+    note = (
+        f"the camera stands and what it shows turns: features are of the {100 * np.mean(shares):.0f} % of the pixels "
+        "that differ from the surroundings; a fit needs masks/ of the bodies, as the surroundings do not turn with "
+        "them (if that is wrong: --set calibrate.turntable=false)"
+    )
+    return [replace(one, image=replace(one.image, mask=folder / "masks", stands=True)) for one in sources], note
 
 
 def _alike(one: str, other: str, sizes: Map[str, tuple[int, int]], lenses: Map[str, int]) -> bool:

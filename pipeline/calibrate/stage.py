@@ -38,6 +38,7 @@ from ..runtime.work_budget import Part, within_budget
 from . import colmap
 from .attempts import MIN_PHOTOS, Candidate, check_figures, estimated, photo_count, photo_labels, search, verdict
 from .center_uncertainty import center_stds
+from .depth_scale import from_depth
 from .given_intrinsics import read_intrinsics
 from .markers import detect_markers, dictionary
 from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
@@ -92,7 +93,7 @@ def calibrate(
     capture = _open(capture_root, overwrite)
     require_place(capture_root / CAMERAS_NAME)  # now, not after minutes
     with _room_for_colmap(capture, config), temporary_directory("calibrate", _TEMPORARY) as folder:
-        inputs = gather(capture, folder, intrinsics)
+        inputs = gather(capture, folder, intrinsics, config.turntable)
         best, attempts = search(folder, inputs, config)
     frame, similarity, world_frame, warnings = _world(capture, best.model)
     model = best.model.transformed(similarity)
@@ -111,8 +112,8 @@ def calibrate(
 
 
 def _input_sha256(root: Path, intrinsics: Path | None) -> str:
-    """Return the hash of all that a calibration reads: the manifest, the photos, the videos, and given intrinsics."""
-    names = [name for name in ("capture.toml", "images", "videos") if (root / name).exists()]
+    """Return the hash of all that a calibration reads: the manifest, photos, masks, depth, videos, given intrinsics."""
+    names = [name for name in ("capture.toml", "images", "masks", "depth", "videos") if (root / name).exists()]
     parts = [f"{name} {sha256(root / name)}" for name in names]
     if intrinsics is not None:
         parts += [f"intrinsics {read_intrinsics(intrinsics)}"]
@@ -174,6 +175,9 @@ def _world(capture: Capture, model: SfmModel) -> tuple[MetricFrame | None, Simil
         frame = from_known_distance(model, calibration.known_distance)
     elif calibration.known_camera_distance:
         frame = from_camera_distance(model, calibration.known_camera_distance)
+    else:
+        names = [name for name in capture.photos() if name in model.T_cam_world]
+        frame = from_depth(model, names, lambda name: capture.photo_maps(name).depth_m)
     if frame is not None and frame.fixes_frame:
         return frame, frame.similarity, frame.source, warnings
     similarity = frame.similarity if frame else Similarity.identity()
