@@ -39,6 +39,8 @@ _PUBLIC = {
     "evaluate": ".pipeline.evaluate",
     "export": ".pipeline.export",
     "fit": ".pipeline.fit",
+    "import_arkit": ".datasets.importers.arkit",
+    "import_realsense": ".datasets.importers.realsense",
     "import_balldrops": ".datasets.importers.balldrops",
     "import_contactnets": ".datasets.importers.contactnets",
     "import_elbow": ".datasets.importers.elbow",
@@ -73,6 +75,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from .datasets.capture import Capture
+    from .datasets.importers.arkit import import_arkit
     from .datasets.importers.balldrops import import_balldrops
     from .datasets.importers.contactnets import import_contactnets
     from .datasets.importers.csv_tracks import import_csv
@@ -84,6 +87,7 @@ if TYPE_CHECKING:
     from .datasets.importers.pinwm import import_pinwm
     from .datasets.importers.posed_photos import import_colmap, import_nerfstudio
     from .datasets.importers.pushes import import_pushes
+    from .datasets.importers.realsense import import_realsense
     from .datasets.importers.rosbag import import_rosbag
     from .datasets.importers.tum import import_tum
     from .datasets.importers.walk_video import import_video
@@ -168,6 +172,7 @@ __all__ = [
     "evaluate",
     "export",
     "fit",
+    "import_arkit",
     "import_balldrops",
     "import_colmap",
     "import_contactnets",
@@ -180,6 +185,7 @@ __all__ = [
     "import_pinwm",
     "import_polycam",
     "import_pushes",
+    "import_realsense",
     "import_record3d",
     "import_rosbag",
     "import_tum",

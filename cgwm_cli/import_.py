@@ -34,6 +34,8 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
     "colmap": ("length_unit",),
     "polycam": (),
     "record3d": ("photos",),
+    "arkit": ("photos",),
+    "realsense": ("photos",),
 }
 """Options that each format takes."""
 
@@ -49,6 +51,8 @@ def import_capture(
             "colmap",
             "polycam",
             "record3d",
+            "arkit",
+            "realsense",
             "csv",
             "tum",
             "hdf5",
@@ -64,11 +68,12 @@ def import_capture(
             metavar="FORMAT",
             help="photos: a folder of photos (.heic, too); video: a walk around the scene, whose sharp frames become "
             "photos; nerfstudio, colmap: photos with cameras (transforms.json, also Blender's; a COLMAP model); "
-            "polycam, record3d: scans of a phone; csv, tum, hdf5, rosbag: your own poses; contactnets: tosses of a "
-            "cube (.pt files or .npz); pinwm: pushes of a block, with frames and masks; jugglebot: throws of a ball; "
-            "balldrops: falling balls; pushes: a robot's finger that pushes an object, with forces (.txt of MLab_EXP, "
-            ".json or .h5 of MIT push); elbow: tosses of two links with a hinge (folder or .tar.xz of .pt files and a "
-            "URDF).",
+            "polycam, record3d: scans of a phone; arkit: a recording of Stray Scanner or a scene of ARKitScenes; "
+            "realsense: a .bag or .db3 of a RealSense camera; csv, tum, hdf5, rosbag: your own poses; contactnets: "
+            "tosses of a cube (.pt files or .npz); pinwm: pushes of a block, with frames and masks; jugglebot: throws "
+            "of a ball; balldrops: falling balls; pushes: a robot's finger that pushes an object, with forces (.txt of "
+            "MLab_EXP, .json or .h5 of MIT push); elbow: tosses of two links with a hinge (folder or .tar.xz of .pt "
+            "files and a URDF).",
             show_default=False,
         ),
     ],
@@ -145,7 +150,9 @@ def import_capture(
     ] = None,
     photos: Annotated[
         int | None,
-        typer.Option("--photos", min=3, help="video, record3d: most photos to take (60).", show_default=False),
+        typer.Option(
+            "--photos", min=3, help="video, record3d, arkit, realsense: most photos to take (60).", show_default=False
+        ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:

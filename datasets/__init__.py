@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .capture.manifest import manifest_toml, write_manifest
     from .capture.tracks import Track, read_tracks, write_tracks
     from .capture.video import read_video
+    from .importers.arkit import import_arkit
     from .importers.balldrops import import_balldrops
     from .importers.contactnets import import_contactnets
     from .importers.csv_tracks import import_csv
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from .importers.pinwm import import_pinwm
     from .importers.posed_photos import import_colmap, import_nerfstudio
     from .importers.pushes import import_pushes
+    from .importers.realsense import import_realsense
     from .importers.recordings import Units
     from .importers.rosbag import import_rosbag
     from .importers.tum import import_tum
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "io.atomic": ("new_directory", "new_file", "sha256"),
+    "importers.arkit": ("import_arkit",),
+    "importers.realsense": ("import_realsense",),
     "importers.balldrops": ("import_balldrops",),
     "capture.cameras": ("Camera", "camera_of", "read_cameras", "to_intrinsics"),
     "capture.capture": ("Capture",),
@@ -94,6 +98,7 @@ __all__ = [
     "Units",
     "camera_of",
     "check_capture",
+    "import_arkit",
     "import_balldrops",
     "import_colmap",
     "import_contactnets",
@@ -106,6 +111,7 @@ __all__ = [
     "import_pinwm",
     "import_polycam",
     "import_pushes",
+    "import_realsense",
     "import_record3d",
     "import_rosbag",
     "import_tum",

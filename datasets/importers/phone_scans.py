@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
@@ -32,7 +33,7 @@ from .photo_captures import Photo, copy_photos, photos_in, write_photo_capture
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 """Turns a world whose y axis points up about x, so that z points up."""
 _UNSURE = 1
-"""Least confidence of a depth of Polycam that is kept."""
+"""Least confidence of a depth of ARKit, 0 to 2 (Polycam: 0 to 255), that is kept."""
 
 
 class _Keyframe(FileModel, extra="ignore"):
@@ -209,18 +210,29 @@ def _copy_depth(root: Path, directory: Path, photos: list[Photo]) -> None:
         (directory / "depth").mkdir()
     for photo in progress(known, "depth", unit="map"):
         stem = Path(photo.name).stem
-        depth = _grey(there[stem], np.uint16)
-        if stem in sure:
-            confidence = _grey(sure[stem], np.uint8)
-            if confidence.shape != depth.shape:
-                raise InputDataError(
-                    f"{sure[stem]}: {confidence.shape[1]}x{confidence.shape[0]} px, but the depth has "
-                    f"{depth.shape[1]}x{depth.shape[0]} px.",
-                    "maps of one size.",
-                )
-            depth = np.where(confidence >= _UNSURE, depth, 0)
-        large = cv2.resize(depth.astype(np.uint16), image_size(photo.source), interpolation=cv2.INTER_NEAREST)
-        write_depth(directory / "depth" / f"{stem}.png", np.asarray(large, np.uint16))
+        depth = sure_depth(there[stem], sure.get(stem))
+        write_enlarged_depth(directory / "depth" / f"{stem}.png", depth, image_size(photo.source))
+
+
+def sure_depth(path: Path, confidence: Path | None) -> NDArray[np.uint16]:
+    """Return a depth map (H, W) [mm], 0 where its map of confidence, if there is one, has 0."""
+    depth = _grey(path, np.uint16)
+    if confidence is None:
+        return np.asarray(depth, np.uint16)
+    sure = _grey(confidence, np.uint8)
+    if sure.shape != depth.shape:
+        raise InputDataError(
+            f"{confidence}: {sure.shape[1]}x{sure.shape[0]} px, but the depth has "
+            f"{depth.shape[1]}x{depth.shape[0]} px.",
+            "maps of one size.",
+        )
+    return np.where(sure >= _UNSURE, depth, 0).astype(np.uint16)
+
+
+def write_enlarged_depth(path: Path, depth_mm: NDArray[np.uint16], size: tuple[int, int]) -> None:
+    """Write a depth map (H, W) [mm] in another size (width, height), each pixel from its nearest."""
+    large = cv2.resize(depth_mm, size, interpolation=cv2.INTER_NEAREST)
+    write_depth(path, np.asarray(large, np.uint16))
 
 
 def _grey(path: Path, kind: Any) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import CamerasFile, CaptureManifest, InputDataError
+from ...schemas import Calibration, CameraIntrinsics, CamerasFile, CaptureManifest, InputDataError
 from ...schemas.imports import ImportResult
 from ...schemas.regular_files import require_regular_file
 from ..capture.files import entries_of
@@ -93,10 +93,25 @@ def copy_photos(directory: Path, photos: Iterable[Photo]) -> None:
 
 
 def write_photo_capture(
-    directory: Path, out: Path | str, photos: int, cameras: CamerasFile | None = None, warnings: Iterable[str] = ()
+    directory: Path,
+    out: Path | str,
+    photos: int,
+    cameras: CamerasFile | None = None,
+    warnings: Iterable[str] = (),
+    intrinsics: tuple[CameraIntrinsics, ...] = (),
 ) -> ImportResult:
-    """Write the manifest, and the cameras where there are some, of a capture whose photos are in place."""
-    write_manifest(directory / "capture.toml", CaptureManifest(format="cgwm-capture/1"))
+    """Write the manifest, and the cameras where there are some, of a capture whose photos are in place.
+
+    Args:
+        directory: The unfinished capture.
+        out: What it will be called.
+        photos: Number of photos.
+        cameras: Cameras with poses; None if they are to be calibrated.
+        warnings: What is to be said.
+        intrinsics: Known intrinsics of photos whose poses are to be calibrated.
+    """
+    known = Calibration(intrinsics=intrinsics)
+    write_manifest(directory / "capture.toml", CaptureManifest(format="cgwm-capture/1", calibration=known))
     if cameras is not None:
         (directory / "cameras.json").write_text(cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
     return ImportResult(

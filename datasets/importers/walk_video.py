@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,14 +64,8 @@ def import_video(source: Path | str, out: Path | str, photos: int = 60, overwrit
     source = Path(source)
     with new_directory(out, "capture", overwrite) as directory:
         require_regular_file(source)
-        figures = measured(source)
-        if figures.walked[-1] < _LEAST_WALK:
-            raise InputDataError(
-                f"{source}: the picture moves by {100 * figures.walked[-1]:.0f} % of its width in "
-                f"{len(figures.walked)} frames: the camera stands.",
-                f"a walk around the scene, over {100 * _LEAST_WALK:.0f} % at least.",
-                "record a slow walk all around; a video of a motion belongs into videos/ of a capture.",
-            )
+        figures = measured(frames_of(source))
+        require_walk(source, figures)
         chosen, blurred = choose(figures, photos)
         if len(chosen) < FEWEST:
             raise InputDataError(
@@ -84,11 +78,23 @@ def import_video(source: Path | str, out: Path | str, photos: int = 60, overwrit
         return write_photo_capture(directory, out, len(chosen), warnings=notes)
 
 
-def measured(path: Path) -> FrameFigures:
-    """Measure the sharpness of each frame, and the motion of the picture up to it."""
+def require_walk(source: Path, figures: FrameFigures) -> None:
+    """Refuse a recording whose camera stands, or that has no frames."""
+    if not len(figures.walked) or figures.walked[-1] < _LEAST_WALK:
+        moved = 100 * figures.walked[-1] if len(figures.walked) else 0.0
+        raise InputDataError(
+            f"{source}: the picture moves by {moved:.0f} % of its width in {len(figures.walked)} frames: the camera "
+            "stands.",
+            f"a walk around the scene, over {100 * _LEAST_WALK:.0f} % at least.",
+            "record a slow walk all around; a video of a motion belongs into videos/ of a capture.",
+        )
+
+
+def measured(frames: Iterable[NDArray[np.uint8]]) -> FrameFigures:
+    """Measure the sharpness of each frame (BGR), and the motion of the picture up to it."""
     sharpness, steps = [], []
     before: NDArray[np.uint8] | None = None
-    for frame in progress(frames_of(path), "video", unit="frame"):
+    for frame in progress(frames, "video", unit="frame"):
         grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
         sharpness.append(float(cv2.Laplacian(_narrowed(grey, _SHARP_WIDTH), cv2.CV_64F).var()))
         small = _narrowed(grey, _FLOW_WIDTH)

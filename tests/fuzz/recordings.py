@@ -113,6 +113,34 @@ def record3d(root: Path) -> None:
     test_photo_importers.write_record3d(root / "scan")
 
 
+def stray(root: Path) -> None:
+    """Write a recording of Stray Scanner."""
+    from datasets.importers import test_sensor_importers
+
+    test_sensor_importers.write_stray(root / "scan", 4)
+
+
+def arkitscenes(root: Path) -> None:
+    """Write a scene of ARKitScenes."""
+    from datasets.importers import test_sensor_importers
+
+    test_sensor_importers.write_arkitscenes(root / "scan", 4)
+
+
+def realsense_bag(root: Path) -> None:
+    """Write a .bag of librealsense."""
+    from datasets.importers import test_sensor_importers
+
+    test_sensor_importers.write_realsense_bag(root / "walk.bag")
+
+
+def realsense_db3(root: Path) -> None:
+    """Write a .db3 of librealsense."""
+    from datasets.importers import test_sensor_importers
+
+    test_sensor_importers.write_realsense_db3(root / "walk.db3")
+
+
 def contactnets_npz(root: Path) -> None:
     """Write tosses as one .npz."""
     from datasets.importers import test_contactnets

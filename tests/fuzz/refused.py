@@ -210,6 +210,8 @@ _DROPS = ("balldrops", "balldrops drops")
 _ELBOW = ("elbow", "elbow elbow")
 _URDF = "elbow/elbow.urdf"
 _SCENE = "scene/transforms.json"
+_ODOMETRY, _MATRIX = "scan/odometry.csv", "scan/camera_matrix.csv"
+_NO_POSE = "1, 0, " + "0, " * 7 + "\n2, 9, "
 _SCAN = "scan/keyframes/cameras/100.json"
 _NO_TURN = '"poses": [[0, 0, 0, 0, 1, 1, 1], ['
 _NET = "contactnets tosses --train 2 --test 1"
@@ -270,6 +272,9 @@ IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("polycam: a pose of zeros", "polycam", "polycam scan", text(_SCAN, '"t_00": ', '"t_00": 9')),
     ("record3d: a quaternion of zeros", "record3d", "record3d scan", text("scan/metadata", '"poses": [[', _NO_TURN)),
     ("record3d: K of text", "record3d", "record3d scan", text("scan/metadata", '"K": [60.0', '"K": ["60"')),
+    ("arkit: a quaternion of zeros", "stray", "arkit scan", text(_ODOMETRY, "100.0, 000000, ", _NO_POSE)),
+    ("arkit: a focal length of 0", "stray", "arkit scan", text(_MATRIX, "150.0, 0.0, 80.0", "0, 0, 80")),
+    ("arkit: no numbers in a .traj", "arkitscenes", "arkit scan", text("scan/lowres_wide.traj", "10.0004", "x")),
     ("contactnets: a pickle as .pt", "contactnets pt", _NET, lambda root: _pickled(root / "tosses/0.pt")),
 )  # fmt: skip
 

@@ -21,6 +21,7 @@ from .captures import (
 )
 from .models import bare, custom, dataset, hand, merged, model, plan, run, task
 from .recordings import (
+    arkitscenes,
     balldrops,
     board_photos,
     bodies_csv,
@@ -38,8 +39,11 @@ from .recordings import (
     phone_photos,
     pinwm,
     polycam,
+    realsense_bag,
+    realsense_db3,
     record3d,
     rosbag,
+    stray,
     things,
     tum,
     walk,
@@ -302,6 +306,10 @@ SUBJECTS = {
         Subject("colmap", "importers", colmap, imports("colmap scene --length-unit m"), weight=0.5),
         Subject("polycam", "importers", polycam, imports("polycam scan"), weight=0.5),
         Subject("record3d", "importers", record3d, imports("record3d scan --photos 4"), weight=0.5),
+        Subject("stray", "importers", stray, imports("arkit scan --photos 4"), weight=0.5),
+        Subject("arkitscenes", "importers", arkitscenes, imports("arkit scan --photos 4"), weight=0.5),
+        Subject("realsense bag", "importers", realsense_bag, imports("realsense walk.bag"), weight=0.5),
+        Subject("realsense db3", "importers", realsense_db3, imports("realsense walk.db3"), weight=0.5),
         Subject("tosses", "captures", write_toss_capture, (), weight=0),
         Subject("things", "outputs", things, (), weight=0),
         Subject("nothing", "captures", lambda root: None, (), weight=0),

@@ -21,7 +21,7 @@ from helpers.thrown_cube import write_capture
 from helpers.tiny_capture import FAST, model_of, thrown, write_tiny_capture
 from pipeline.sg_gs.test_sg_gs import make_capture
 
-from datasets.importers import test_photo_importers
+from datasets.importers import test_photo_importers, test_sensor_importers
 from pipeline.calibrate import test_calibrate
 
 
@@ -186,6 +186,12 @@ def _import_video(folder: Path) -> Command:
     return Command(words=words, out=("out",), check=(["validate", str(folder / "out")],))
 
 
+def _import_arkit(folder: Path) -> Command:
+    test_sensor_importers.write_arkitscenes(folder / "scan")
+    words = ["import", "arkit", str(folder / "scan"), "--out", str(folder / "out")]
+    return Command(words=words, out=("out",), check=(["validate", str(folder / "out")],))
+
+
 def _control(folder: Path) -> Command:
     write_small_model(folder / "model", visible=False)
     (folder / "task.toml").write_text(task_toml(push_task()))
@@ -215,6 +221,7 @@ CASES: dict[str, Callable[[Path], Command]] = {
     "export usd": _usd,
     "import csv": _import,
     "import video": _import_video,
+    "import arkit": _import_arkit,
     "improve": _improve,
     "control": _control,
     "control --overwrite": _replacing(_control, "--draws", "2"),
