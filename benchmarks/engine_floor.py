@@ -32,7 +32,7 @@ from cgwm.datasets.synthetic.dynamics import GRAVITY, rest_pose
 from cgwm.schemas import NotConvergedError
 from store import Store
 from tabletop.capture import TASKS, Task, plan_capture
-from tabletop.engines import ENGINES, refusal
+from tabletop.engines import ENGINES, JUDGES, refusal
 from tabletop.materials import MATERIALS
 from tabletop.objects import load_item
 from tabletop.true_world import Numbers, Spheres, pose_errors, spheres_of, true_world
@@ -139,7 +139,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     ]
     report = [row for row in rows if row["stage"] == "report"]
     for task, engine in itertools.product(TASKS, (*ENGINES, "all but mujoco")):
-        engines = [one for one in ENGINES if one not in ("mujoco", "mujoco_default")] if " " in engine else [engine]
+        engines = [one for one in JUDGES if one not in ("mujoco", "mujoco_default")] if " " in engine else [engine]
         chosen = [row for row in report if row["task"] == task and row["engine"] in engines and "errors" in row]
         if not chosen:
             continue
@@ -185,7 +185,7 @@ def friction_table() -> str:
     """Return the friction of every engine by direction in Markdown."""
     lines = ["| engine | " + " | ".join(f"{angle:g} deg" for angle in DIRECTIONS_DEG) + " |"]
     lines += ["| --- |" + " --- |" * len(DIRECTIONS_DEG)]
-    for name in ENGINES:
+    for name in JUDGES:
         reason = refusal(name, load_item("box").solid)
         cells = [reason] if reason else [f"{value:.3f}" for value in friction_by_direction(name)]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
@@ -197,7 +197,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "table", "friction"))
     parser.add_argument("--stage", choices=tuple(FIRST_SEED), default="dev")
-    parser.add_argument("--engines", default=",".join(ENGINES))
+    parser.add_argument("--engines", default=",".join(JUDGES))
     parser.add_argument("--captures", type=int, default=8, help="of every engine and task")
     parser.add_argument("--tests", type=int, default=10, help="episodes of a capture")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")

@@ -14,23 +14,28 @@ the model of an object is fitted once a task, to the photos of the first materia
 from __future__ import annotations
 
 import argparse
+import itertools
 import multiprocessing
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 from cgwm.pipeline.fit import fit
-from cgwm.schemas import CgwmError, SplatConfig
+from cgwm.schemas import CgwmError, NotConvergedError, SplatConfig
 from contenders.base import Cell
+from contenders.cgwm_default import FittedCgwm
 from contenders.rows import REFERENCE, ROWS
 from fall_push_engines import engine_table
 from fall_push_table import table
 from scoring import Judge
+from steps import Step, run_steps
 from store import Store, timed
 from tabletop.capture import TASKS, Task
 from tabletop.engines import ENGINES, refusal
@@ -98,9 +103,13 @@ class Work:
 
 def measure(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, Any]:
     """Fit and judge one row in one cell. A fit that fails is a result, too: `failed` says why."""
-    figures: dict[str, Any] = {key: getattr(job, key) for key in ("task", "object", "material", "row", "engine")}
-    figures |= {"seed": job.cell.seed, "device": job.cell.device, "budget_s": budget_s, "psnr_every": psnr_every}
+    figures = _of_job(job) | {"budget_s": budget_s, "psnr_every": psnr_every}
     return figures | timed(lambda: _measured(job, budget_s, psnr_every))
+
+
+def _of_job(job: Job) -> dict[str, Any]:
+    figures = {key: getattr(job, key) for key in ("task", "object", "material", "row", "engine")}
+    return figures | {"seed": job.cell.seed, "device": job.cell.device}
 
 
 def _measured(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, Any]:
@@ -112,51 +121,101 @@ def _measured(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, An
         return {"failed": reason, "fit": {"seconds": round(time.perf_counter() - started, 2)}}
     judge, record = Judge.of(job.cell, psnr_every), fitted.record
     errors = judge.parameter_errors(record.get("parameters", {}))
+    budget = {}
+    if isinstance(fitted, FittedCgwm) and job.row == REFERENCE:
+        truth = judge.truth.contact
+        known = fitted.with_friction(truth.friction, truth.friction_fingertip)
+        budget = {"true_friction": replace(judge, videos=None).episode_errors(known)}
     if job.engine != ENGINE:  # nobody else has the numbers of MuJoCo's contacts
         errors = {name: value for name, value in errors.items() if name == "friction"}
-    return {"fit": record, "parameter_errors": errors, "episodes": judge.episode_errors(fitted)}
+    return {"fit": record, "parameter_errors": errors, "episodes": judge.episode_errors(fitted)} | budget
 
 
-def run(work: Work, store: Store, names: dict[str, Sequence[str]], pool: Executor, psnr_every: int) -> None:
-    """Make what is missing of captures, models and results; references first, since they set the others' budgets.
+def run(
+    work: Work,
+    store: Store,
+    names: dict[str, Sequence[str]],
+    pool: Executor,
+    psnr_every: int,
+    captures: int | None = None,
+    workers: int = 1,
+    seconds: float = float("inf"),
+) -> int:
+    """Make what is missing of captures, models and results, and return how many steps are left.
+
+    Cell by cell; in each the reference first, since it sets the others' budgets.
 
     Args:
         work: Where things lie.
         store: Takes the results, as they come.
-        names: Which tasks, objects, materials, engines and rows are wanted; what an engine cannot simulate is left out.
+        names: Which tasks, objects, materials, engines and rows are wanted.
         pool: Who works.
         psnr_every: Compare every so manyth frame of the test videos; 0: none.
+        captures: So many captures of every engine and task, see `drawn`; None for all.
+        workers: How many steps run at once.
+        seconds: No step begins later.
     """
-    pairs = [(task, obj) for task in names["tasks"] for obj in names["objects"]]
-    cells = [
-        (task, obj, material, engine)
-        for task, obj in pairs
-        for material in names["materials"]
+    made: dict[tuple[str, ...], Step] = {}
+    steps: list[Step] = []
+
+    def once(key: tuple[str, ...], make: Callable[[], Step]) -> Step:
+        if key not in made:
+            made[key] = make()
+            steps.append(made[key])
+        return made[key]
+
+    for cell in drawn(names, captures):
+        task, obj, material, engine = cell
+        of_cell = work.cell(task, obj, material, engine)
+        jobs = [Job(task, obj, material, row, of_cell, engine) for row in names["rows"]]
+        jobs = [job for job in jobs if store.known(job.key) is None]
+        if not jobs:
+            continue
+        capture = once(cell, partial(_capture_step, work, store, jobs, cell))
+        splats = once(cell[:2], partial(Step, work.make_splats, lambda cell=cell: cell, (capture,)))
+        reference = [_measuring(store, job, (capture, splats), psnr_every) for job in jobs if job.row == REFERENCE]
+        steps += reference
+        needs = (capture, splats, *reference)
+        steps += [_measuring(store, job, needs, psnr_every) for job in jobs if job.row != REFERENCE]
+    return run_steps(pool, steps, workers, seconds)
+
+
+def drawn(names: dict[str, Sequence[str]], captures: int | None) -> list[tuple[str, str, str, str]]:
+    """Return task, object, material and engine of every capture, without those that the engine cannot simulate.
+
+    With a number of captures: of every engine and task so many, in an order of objects and materials that is drawn once
+    and for all, first one of each task and engine, then another.
+    """
+    pairs = list(itertools.product(names["objects"], names["materials"]))
+    if captures is not None:
+        pairs = [pairs[k] for k in np.random.default_rng(0).permutation(len(pairs))]
+    able = {
+        engine: [pair for pair in pairs if refusal(engine, load_item(pair[0]).solid) is None][:captures]
         for engine in names["engines"]
-        if refusal(engine, load_item(obj).solid) is None
+    }
+    cells = [
+        (index, (task, *pair, engine))
+        for engine in names["engines"]
+        for task in names["tasks"]
+        for index, pair in enumerate(able[engine])
     ]
-    jobs = [
-        Job(task, obj, material, row, work.cell(task, obj, material, engine), engine)
-        for task, obj, material, engine in cells
-        for row in names["rows"]
-    ]
-    jobs = [job for job in jobs if store.known(job.key) is None]
-    wanted = sorted({(job.task, job.object, job.material, job.engine) for job in jobs})
-    photographed = sorted({cell[:2]: cell for cell in reversed(wanted)}.values())
+    return [cell for _, cell in (sorted(cells, key=lambda one: one[0]) if captures is not None else cells)]
 
-    def each(function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> None:
-        for done in as_completed([pool.submit(function, *one) for one in arguments]):
-            done.result()
 
-    def measured(now: Sequence[Job]) -> None:
-        waiting = {pool.submit(measure, job, _budget(store, job), psnr_every): job for job in now}
-        for done in as_completed(waiting):
-            store.add(waiting[done].key, done.result())
+def _capture_step(work: Work, store: Store, jobs: Sequence[Job], cell: tuple[str, str, str, str]) -> Step:
+    """Return the step that makes a capture; where no motion serves, its results say so."""
 
-    each(work.make_capture, sorted({*wanted, *photographed}))
-    each(work.make_splats, photographed)
-    measured([job for job in jobs if job.row == REFERENCE])
-    measured([job for job in jobs if job.row != REFERENCE])
+    def spoils(error: BaseException) -> None:
+        if not isinstance(error, NotConvergedError):
+            raise error
+        for job in jobs:
+            store.add(job.key, {**_of_job(job), "not_run": error.found})
+
+    return Step(work.make_capture, lambda: cell, spoils=spoils)
+
+
+def _measuring(store: Store, job: Job, needs: Sequence[Step], psnr_every: int) -> Step:
+    return Step(measure, lambda: (job, _budget(store, job), psnr_every), needs, partial(store.add, job.key))
 
 
 def _budget(store: Store, job: Job) -> float | None:
@@ -180,9 +239,11 @@ def main() -> int:
     parser.add_argument("--objects", default=",".join(OBJECTS))
     parser.add_argument("--materials", default=",".join(MATERIALS))
     parser.add_argument("--rows", default="; ".join(ROWS), help="names of rows, separated by semicolons")
+    parser.add_argument("--captures", type=int, help="of every engine and task, drawn; left out, all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no step after this time")
     parser.add_argument("--folder", type=Path, default=Path("out") / "fall_push", help="captures and models")
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
     parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
@@ -208,7 +269,8 @@ def main() -> int:
     if not given.table:
         work = Work(given.folder.resolve(), given.seed, given.device)
         with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            run(work, store, names, pool, given.psnr_every)
+            left = run(work, store, names, pool, given.psnr_every, given.captures, given.workers, given.seconds)
+        print(f"{left} steps are left.", file=sys.stderr)
     print(engine_table(store.results(), names) if given.by_engine else table(store.results(), names, given.seed))
     return 0
 

@@ -33,6 +33,7 @@ def engine_table(results: Sequence[dict[str, Any]], names: dict[str, Sequence[st
         for row in results
         if row.get("engine", "mujoco") in names["engines"]
         and all(row.get(one) in names[f"{one}s"] for one in ("task", "object", "material", "row"))
+        and "not_run" not in row
     ]
     parts = [
         "Medians over the test episodes of each capture, then median (mean) over captures. Differences are paired by "

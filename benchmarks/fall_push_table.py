@@ -27,6 +27,7 @@ def table(results: Sequence[dict[str, Any]], names: dict[str, Sequence[str]], se
         row
         for row in results
         if row.get("seed") == seed
+        and "not_run" not in row
         and row.get("engine", "mujoco") in names["engines"]
         and all(row.get(one) in names[f"{one}s"] for one in ("task", "object", "material", "row"))
     ]

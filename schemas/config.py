@@ -87,6 +87,8 @@ class PhysConfig(FileModel):
     """Video frames are reduced to this longer side [px] for fitting."""
     geometry: bool = True
     """Whether the colliding spheres that touch are refined with the images, through the motion alone."""
+    contact_law: Literal["closed_form", "paper"] = "closed_form"
+    """Law of contact that is fitted: ours, or the ContactGaussian-WM paper's, which the torch engine alone has."""
     effects: tuple[str, ...] = ()
     """Effects to add to the model and to fit: names of built-in ones, or `path/to/file.py:ClassName`."""
     mass_distribution: bool | Literal["auto"] = "auto"

@@ -165,7 +165,7 @@ class BodyModel(FileModel):
 
 
 class ContactParameters(FileModel):
-    """The contact law's numbers (contact model `closed_form`)."""
+    """The contact law's numbers; with the contact model `paper` those of a body on 16 rows, which fix K and D."""
 
     friction: Friction = 0.5
     """Coulomb coefficient [1]."""
@@ -185,7 +185,8 @@ class PairContact(ContactParameters):
 class Solver(FileModel):
     """How the model is integrated."""
 
-    contact_model: Literal["closed_form"] = "closed_form"
+    contact_model: Literal["closed_form", "paper"] = "closed_form"
+    """Law of contact: ours, or that of the ContactGaussian-WM paper with its distance between bodies."""
     step_s: Step = 0.001
     sweeps: Annotated[int, Field(ge=1, le=10_000)] = 10
     """Projected sweeps over the contacts; 1 is the closed form alone, more let contacts that touch at once agree."""

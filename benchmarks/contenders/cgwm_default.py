@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import Model, read_model
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.world import State, World
-from cgwm.schemas import PhysConfig
+from cgwm.schemas import PhysConfig, UsageError
 
 from .base import Array, Cell, Prediction
 from .training import rolled_out
@@ -62,6 +62,16 @@ class FittedCgwm:
             "pose_tracks": stage.get("pose_tracks", {}),
             "warnings": list(file.warnings),
         }
+
+    def with_friction(self, ground: float, fingertip: float | None) -> FittedCgwm:
+        """Return the model with other frictions, of the ground and of a fingertip, where there is one [1]."""
+        file = self.model.file
+        if file.contact is None:
+            raise UsageError("the model has no fitted physics.")
+        change = {"contact": file.contact.model_copy(update={"friction": ground})}
+        if fingertip is not None:
+            change["pairs"] = tuple(pair.model_copy(update={"friction": fingertip}) for pair in file.pairs)
+        return replace(self, model=replace(self.model, file=file.model_copy(update=change)))
 
     def predict(self, start: State, drives: Mapping[str, Track], times_s: Array) -> Prediction:
         """Predict open loop with the fitted world."""

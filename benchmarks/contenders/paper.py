@@ -7,7 +7,7 @@ frames, before.
 
 What the paper does not disclose, and what it is here (contact model notes, sections 6, 7 and 11; recorded with each
 fit): beta 2000 1/m, delta 5 mm (less would let a body of tau = 20 ms sink through: delta > g tau^2), gamma = 1/delta,
-with the offset W(1) delta of the clamp's zero taken off the ground and the driven bodies; 4 directions; steps of 2
+with the offset W(1) delta of the clamp's zero taken off; 4 directions; steps of 2
 ms; SoftPlus of sharpness 100 n / (m g); n = 16 rows in contact; start K = m / (n tau^2), D = 2 zeta m / (n tau), tau
 20 ms, zeta 1, mu 0.3; M starts at the mass that the capture gives, and inertia goes with it; Adam's rates, 100
 iterations, and a longest gradient. The collision spheres are those distilled from the splats, at most 200, for
@@ -25,7 +25,7 @@ from typing import Any
 
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.physics.paper_law import PaperLaw
+from cgwm.pipeline.physics.paper_law import CLAMP_ZERO, PaperLaw
 from cgwm.pipeline.physics.rollout import simulate
 from cgwm.pipeline.physics.world import State, World
 from cgwm.schemas import InputDataError, NotConvergedError
@@ -51,8 +51,6 @@ CONSTANTS: dict[str, float] = {
     "max_slope": 10.0,
 }
 """What the paper does not disclose."""
-OMEGA = 0.5671432904097838
-"""W(1): the clamp's distance vanishes at W(gamma delta) / gamma."""
 
 
 @dataclass(frozen=True)
@@ -149,12 +147,7 @@ class _Form:
         world = training.world
         if len(world.free) != 1:
             raise NotConvergedError(f"the paper's form: {len(world.free)} free bodies.", "one.")
-        shift = OMEGA * CONSTANTS["delta_m"]
-        offset = None if world.ground_offset is None else world.ground_offset - shift
-        base = replace(world, ground_offset=offset, step_s=CONSTANTS["step_s"])
-        for index, body in enumerate(world.bodies):
-            if not body.free:
-                base = base.with_body(index, radii=(body.radii - shift).clamp_min(1e-4))
+        base = replace(world, step_s=CONSTANTS["step_s"])
         index = world.free[0]
         bodies = list(base.bodies)
         bodies[index] = replace(bodies[index], on_plane=None)  # all rows count, as published
@@ -174,15 +167,15 @@ class _Form:
         body, c = self.base.bodies[self.index], CONSTANTS
         factor, friction, stiffness, damping = point[0].exp().unbind(0)
         weight = float(body.mass[0]) * float(self.base.gravity.norm())
-        law = PaperLaw(
-            friction=friction[None],
-            stiffness_n_m=stiffness[None],
-            damping_n_s_m=damping[None],
+        rows = PaperLaw.of_rows(friction[None], stiffness[None], damping[None])
+        law = replace(
+            rows,
             directions=int(c["directions"]),
             softplus_per_n=c["softplus_times_weight"] * c["rows_in_contact"] / weight,
             sharpness_per_m=c["beta_per_m"],
             clamp_depth_m=c["delta_m"],
             clamp_per_m=c["gamma_per_m"],
+            zero_m=CLAMP_ZERO * c["delta_m"],
         )
         moved = self.base.with_body(
             self.index,

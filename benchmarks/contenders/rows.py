@@ -15,6 +15,7 @@ from .floor import Floor
 from .latent import Latent
 from .paper import Paper
 from .pinwm import PinWm
+from .true_parts import Part, TruePart
 from .zeros import Ballistic, Frozen
 
 REFERENCE = "cgwm"
@@ -56,12 +57,19 @@ def _latent(data: str, solid: Callable[[Path], SolidObject] | None, budget: floa
     return name, Row(lambda: Latent(name, solid), budget)
 
 
+def _true(part: Part) -> tuple[str, Row]:
+    name = f"{REFERENCE}, true {part}"
+    return name, Row(lambda: TruePart(name, part))
+
+
 FIXED = f"{REFERENCE}, geometry fixed"
+PUBLISHED = f"{REFERENCE}, contact_law=paper"
 
 ROWS: dict[str, Row] = dict(
     (
         (REFERENCE, Row(Cgwm)),
         (FIXED, Row(lambda: Cgwm(FIXED, {"geometry": False}))),
+        (PUBLISHED, Row(lambda: Cgwm(PUBLISHED, {"contact_law": "paper"}))),
         _paper(4),
         _mujoco("true mesh", true_solid, 1),
         _mujoco("true mesh", true_solid, 4),
@@ -76,6 +84,9 @@ ROWS: dict[str, Row] = dict(
         (Frozen.name, Row(Frozen)),
         (Ballistic.name, Row(Ballistic)),
         (Floor.name, Row(Floor)),
+        _true("shape"),
+        _true("mass"),
+        _true("poses"),
     )
 )
 """By name, in the table's order."""

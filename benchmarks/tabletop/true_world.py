@@ -136,12 +136,17 @@ def pose_errors(world: World, plan: ScenePlan, episode: EpisodePlan) -> tuple[fl
 def _predicted(world: World, episode: EpisodePlan, times_s: Array) -> tuple[Array, Array]:
     motion = episode.motion
     row = motion.row(0.0)
-    pose, rate = motion.qpos[row], motion.qvel[row]
     tracks = {FINGERTIP: finger_track(episode)} if len(world.bodies) > 1 else {}
-    start = State(*(_stacked(len(world.bodies), values) for values in (pose[:3], pose[3:7], rate[:3], rate[3:6])))
+    start = first_state(world, motion.qpos[row], motion.qvel[row])
     with torch.no_grad():
         rollout = measure(world, start, torch.as_tensor(times_s), tracks)
     return rollout.position_m[0, :, 0].numpy(), rollout.quat_wxyz[0, :, 0].numpy()
+
+
+def first_state(world: World, qpos: Array, qvel: Array) -> State:
+    """Return the state of a world whose object has a pose (7,) [m, quat_wxyz] and velocities (6,) [m/s, rad/s]."""
+    parts = (qpos[:3], qpos[3:7], qvel[:3], qvel[3:6])
+    return State(*(_stacked(len(world.bodies), values) for values in parts))
 
 
 def _stacked(bodies: int, values: Array) -> torch.Tensor:

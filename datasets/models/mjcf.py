@@ -28,6 +28,7 @@ from ...schemas.materials import pair_of
 from ...schemas.surfaces import Surface
 from ..capture.cameras import Camera
 from ..shapes.meshes import Mesh
+from .laws import refuse_paper_law
 from .model import Model
 
 MIN_DAMPING_RATIO = 1e-3
@@ -79,8 +80,12 @@ def write_mjcf(
         cameras: Cameras to add, by name; MJCF cannot represent their distortion.
         keyframe: A start to add.
         source: Origin of the model, which the file mentions.
+
+    Raises:
+        InputDataError: If the model has the contact law of the paper, which MuJoCo cannot express.
     """
     file = model.file
+    refuse_paper_law(file, model.place, "MJCF")
     root = ET.Element("mujoco", model="cgwm")
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     # RK4: the other integrators damp the tumbling of a free body.

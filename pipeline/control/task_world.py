@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from ...datasets.models.joints import refuse_joints
+from ...datasets.models.laws import refuse_paper_law
 from ...datasets.models.model import Model
 from ...datasets.shapes.ply import Splats
 from ...schemas import BodyModel, ControlTask, InputDataError, ModelFile, did_you_mean
@@ -163,11 +164,12 @@ def softened(world: World, step_s: float) -> World:
 
 
 def require_rigid(model: Model) -> None:
-    """Check that a model has no jointed bodies.
+    """Check that a model has no jointed bodies, and the contact law that control knows to soften.
 
     Raises:
-        InputDataError: If it has some.
+        InputDataError: If it has joints, or another law.
     """
+    refuse_paper_law(model.file, model.place, "control")
     instead = "the object is one rigid body; the Python API's ClosedLoop steps jointed ones (docs/python-api.md)"
     refuse_joints(model.file.articulations, model.place, "control", instead)
 

@@ -15,6 +15,7 @@ from ...datasets.capture.capture import Capture
 from ...datasets.io.atomic import new_file
 from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note
+from ...datasets.models.laws import refuse_paper_law
 from ...datasets.models.model import Model, read_model
 from ...schemas import (
     ContactLimit,
@@ -294,6 +295,7 @@ def _world(model: Model, capture: Capture) -> World:
             "a model of this capture's bodies.",
             f"run 'cgwm fit {capture.root} --out MODEL'.",
         )
+    refuse_paper_law(model.file, model.place, "diagnose")
     world = World.from_model(model)
     ground = capture.manifest.world.ground
     if ground is None or world.ground_offset is None:

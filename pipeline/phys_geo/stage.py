@@ -39,6 +39,7 @@ from ..segments.described_motion import not_described
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from .material_pairs import require_known_pairs, start_laws, with_pusher_law
+from .paper_setting import require_paper_law
 from .surface_starts import require_outside
 from .tracks.contact_result import PhysicsFit
 from .tracks.earlier_estimates import GROUND, EarlierEstimates
@@ -71,7 +72,10 @@ def fit_motion(
     """
     _require_fittable(model, capture, config)
     require_known_pairs(capture, split)
-    capture = replace(capture, manifest=with_pusher_law(capture.manifest))
+    if config.contact_law == "closed_form":
+        capture = replace(capture, manifest=with_pusher_law(capture.manifest))
+    else:
+        require_paper_law(model.file, capture, config)
     ready = _with_surfaces(replace(model, file=_physics_start(model, capture, config)), capture)
     if config.supervise == "tracks":
         require_outside(World.from_model(ready), capture, split)
@@ -120,7 +124,7 @@ def _physics_start(model: Model, capture: Capture, config: PhysConfig) -> ModelF
             "pairs": laws.pairs,
             # the ground of the capture, as an earlier fit may have moved the model's
             "ground": capture.manifest.world.ground or model.file.ground,
-            "solver": Solver(step_s=config.step_s, sweeps=_sweeps(model.file)),
+            "solver": Solver(contact_model=config.contact_law, step_s=config.step_s, sweeps=_sweeps(model.file)),
             "effects": effects,
             "warnings": tuple(text for text in model.file.warnings if text not in stale),
         }

@@ -289,7 +289,7 @@ class Contacts:
         law = self.world.contact
         if isinstance(law, PaperLaw):
             law = replace(
-                law, stiffness_n_m=take(law.stiffness_n_m, items), damping_n_s_m=take(law.damping_n_s_m, items)
+                law, contact_time_s=take(law.contact_time_s, items), damping_ratio=take(law.damping_ratio, items)
             )
             return [Impulses(paper_impulses(law, touch, axes)) for _, _, touch, axes in found]
         groups = []

@@ -7,6 +7,9 @@ to 5). One explicit evaluation of polyhedral rows n - mu d on every contact, sti
 
 Differences from the default law: the stiffness grows with the number of touching spheres, the restitution depends on
 the step, bodies creep on slopes on which friction should hold them, and a sliding body floats higher than one at rest.
+
+K and D are given by a natural time tau and a damping ratio zeta of a body of mass m that rests on `ROWS` rows (contact
+model notes, section 11): K = m / (ROWS tau^2), D = 2 zeta m / (ROWS tau). That is a change of variables and no more.
 """
 
 from __future__ import annotations
@@ -21,6 +24,19 @@ from torch.nn.functional import softplus
 
 from .contact_law import Touch
 
+DIRECTIONS = 4
+"""Rows of a contact's friction pyramid."""
+ROWS = 16
+"""Rows in contact for which K and D are stated: those of a box on its four lower corners."""
+SHARPNESS_PER_M = 2000.0
+"""beta of the log-sum-exp distance [1/m]."""
+CLAMP_DEPTH_M = 0.005
+"""delta of the clamp [m]; gamma is its inverse. Less would let a body of tau = 20 ms sink through: delta > g tau^2."""
+CLAMP_ZERO = 0.5671432904097838
+"""W(1): for gamma delta = 1 the clamped distance vanishes at W(1) delta."""
+SOFTPLUS_OF_WEIGHT = 100.0
+"""Sharpness of SoftPlus times the share of a body's weight that a row carries [1]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PaperLaw:
@@ -29,11 +45,13 @@ class PaperLaw:
     name: ClassVar[str] = "published"
     friction: Tensor
     """Coulomb friction coefficient [1]."""
-    stiffness_n_m: Tensor
-    """Stiffness K of a row [N/m]."""
-    damping_n_s_m: Tensor
-    """Damping D of a row [N s/m]."""
-    directions: int = 4
+    contact_time_s: Tensor
+    """Natural time tau [s] of `row_mass_kg` on one row."""
+    damping_ratio: Tensor
+    """Damping ratio zeta [1] of `row_mass_kg` on one row."""
+    row_mass_kg: float = 1.0
+    """Mass by which tau and zeta give K and D: K = mass / tau^2, D = 2 zeta mass / tau [kg]."""
+    directions: int = DIRECTIONS
     """Number of rows of a contact's friction pyramid."""
     softplus_per_n: float = math.inf
     """Sharpness of SoftPlus [1/N]; infinite for a plain maximum."""
@@ -43,6 +61,49 @@ class PaperLaw:
     """Depth delta of the sigmoid clamp of the distance [m]; None for no clamp."""
     clamp_per_m: float | None = None
     """Sharpness gamma of the sigmoid clamp of the distance [1/m]; None for no clamp."""
+    zero_m: float = 0.0
+    """Distance [m] at which the clamped distance vanishes, which is taken off: bodies then touch at their surfaces."""
+
+    @property
+    def stiffness_n_m(self) -> Tensor:
+        """Stiffness K of a row [N/m]."""
+        return self.row_mass_kg / self.contact_time_s.square()
+
+    @property
+    def damping_n_s_m(self) -> Tensor:
+        """Damping D of a row [N s/m]."""
+        return 2 * self.row_mass_kg * self.damping_ratio / self.contact_time_s
+
+    @staticmethod
+    def of_rows(friction: Tensor, stiffness_n_m: Tensor, damping_n_s_m: Tensor) -> PaperLaw:
+        """Return the law of rows of K [N/m] and D [N s/m], with a plain maximum and distances that are not clamped."""
+        time = stiffness_n_m.rsqrt()
+        return PaperLaw(friction=friction, contact_time_s=time, damping_ratio=0.5 * damping_n_s_m * time)
+
+    @staticmethod
+    def of_body(
+        friction: Tensor, contact_time_s: Tensor, damping_ratio: Tensor, mass_kg: float, weight_n: float
+    ) -> PaperLaw:
+        """Return the law as published, with this file's values of what the paper does not disclose.
+
+        Args:
+            friction: Coulomb friction coefficient [1].
+            contact_time_s: Natural time of the body on `ROWS` rows [s].
+            damping_ratio: Damping ratio of the same [1].
+            mass_kg: Mass of the body [kg].
+            weight_n: Its weight [N].
+        """
+        return PaperLaw(
+            friction=friction,
+            contact_time_s=contact_time_s,
+            damping_ratio=damping_ratio,
+            row_mass_kg=mass_kg / ROWS,
+            softplus_per_n=SOFTPLUS_OF_WEIGHT * ROWS / weight_n if weight_n > 0 else math.inf,
+            sharpness_per_m=SHARPNESS_PER_M,
+            clamp_depth_m=CLAMP_DEPTH_M,
+            clamp_per_m=1 / CLAMP_DEPTH_M,
+            zero_m=CLAMP_ZERO * CLAMP_DEPTH_M,
+        )
 
 
 def clamped(distance: Tensor, depth_m: float, per_m: float) -> Tensor:
@@ -92,7 +153,7 @@ def paper_impulses(law: PaperLaw, touch: Touch, axes: Tensor) -> Tensor:
     free = (axes @ touch.velocity[..., None]).squeeze(-1)
     gap = touch.gap
     if law.clamp_depth_m is not None and law.clamp_per_m is not None:
-        gap = clamped(gap, law.clamp_depth_m, law.clamp_per_m)
+        gap = clamped(gap + law.zero_m, law.clamp_depth_m, law.clamp_per_m)
     angle = torch.arange(law.directions).to(gap) * (2 * math.pi / law.directions)
     facets = torch.stack((angle.cos(), angle.sin()), -1)
     along = free[..., :1] - touch.friction[..., None] * (free[..., 1:] @ facets.T)

@@ -109,6 +109,12 @@ GROUND_SHIFT = Parameter(
 )
 CONTACT_PARAMETERS = (FRICTION, CONTACT_TIME, DAMPING_RATIO)
 """Coefficients of the contact law."""
+PAPER_PARAMETERS = (
+    FRICTION,
+    replace(CONTACT_TIME, bounds=(0.002, 0.1), prior=(0.02, 0.7)),
+    replace(DAMPING_RATIO, bounds=(0.01, 10.0), prior=(1.0, 0.6)),
+)
+"""Those of the paper's law, K and D by a natural time and a damping ratio; medians: contact model notes, section 11."""
 
 
 def contact_parameters(world: World, medians: Mapping[str, float] | None = None) -> list[Parameter]:
@@ -119,10 +125,11 @@ def contact_parameters(world: World, medians: Mapping[str, float] | None = None)
         medians: Medians of their priors by name, where more is known than the priors of `CONTACT_PARAMETERS` say.
     """
     known = medians or {}
+    coefficients = PAPER_PARAMETERS if isinstance(world.contact, PaperLaw) else CONTACT_PARAMETERS
     return [
         _of_pair(parameter, pair, known.get(of_pair(parameter.name, pair)))
         for pair in laws_in_use(world).materials
-        for parameter in CONTACT_PARAMETERS
+        for parameter in coefficients
     ]
 
 

@@ -287,8 +287,12 @@ class World:
             for index in range(len(file.bodies))
         ]
 
-        def law_of(numbers: ContactParameters) -> ContactLaw:
-            return ContactLaw(*(tensor(v) for v in (numbers.friction, numbers.contact_time_s, numbers.damping_ratio)))
+        def law_of(numbers: ContactParameters) -> ContactLaw | PaperLaw:
+            values = [tensor(v) for v in (numbers.friction, numbers.contact_time_s, numbers.damping_ratio)]
+            if file.solver.contact_model == "closed_form":
+                return ContactLaw(*values)
+            mass = min(body.mass_kg for body in file.bodies if body.motion == "free")
+            return PaperLaw.of_body(*values, mass, mass * float(np.linalg.norm(file.gravity_m_s2)))
 
         ground = file.ground
         world = World(
@@ -299,7 +303,7 @@ class World:
             ground_normal=tensor(ground.normal)[0] if ground else None,
             ground_offset=tensor(ground.offset_m) if ground else None,
             contact=law_of(file.contact),
-            pair_laws={pair_of(*pair.materials): law_of(pair) for pair in file.pairs},
+            pair_laws={pair_of(*pair.materials): law_of(pair) for pair in file.pairs},  # pyright: ignore[reportArgumentType]
             ground_material=ground.material if ground else None,
             step_s=file.solver.step_s,
             iterations=file.solver.sweeps,
@@ -370,9 +374,11 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         spheres = model.collision[entry.name]
         centers, radii = tensor(spheres.means), tensor(spheres.scales * entry.radius_factor)
         place = tensor((*entry.photo_pose.position_m, *entry.photo_pose.quat_wxyz))
-        on_plane = plane_contacts(centers[0], radii[0])
-        hull = Hull.of(centers[0], radii[0], on_plane) if entry.convex else None
-        patch = _patch(entry, hull, centers[0], radii[0])
+        on_plane = hull = patch = None
+        if model.file.solver.contact_model == "closed_form":  # as published, every sphere is a contact of its own
+            on_plane = plane_contacts(centers[0], radii[0])
+            hull = Hull.of(centers[0], radii[0], on_plane) if entry.convex else None
+            patch = _patch(entry, hull, centers[0], radii[0])
     else:
         centers, radii, place, on_plane = geometry.centers, geometry.radii, geometry.place, geometry.on_plane
         hull, patch = geometry.hull, geometry.patch

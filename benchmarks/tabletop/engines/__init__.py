@@ -1,4 +1,4 @@
-"""The engines whose motions are the truth of Fall, Push and Tip; none of them is cgwm's, Bullet or PhysX (held out).
+"""The engines whose motions are the truth of Fall, Push and Tip; Bullet and PhysX are held out.
 
 Each has a law of contact of its own. Given are a ground's friction and the restitution of a ball on it; what else an
 engine wants to know is its own, and stands in its module.
@@ -14,7 +14,7 @@ from importlib import import_module
 from cgwm.datasets.synthetic.dynamics import ContactTruth
 from cgwm.datasets.synthetic.objects import SolidObject
 
-from . import dart_engine, drake_engine, mujoco_engine, rapier_engine
+from . import dart_engine, drake_engine, mujoco_engine, own_engine, rapier_engine
 from .stepper import Engine
 
 Maker = Callable[[SolidObject, ContactTruth, bool], Engine]
@@ -36,8 +36,11 @@ ENGINES: dict[str, Entry] = {
     "drake": Entry(drake_engine.Drake, "pydrake"),
     "dart": Entry(dart_engine.Dart, "dartpy", any_solid=False),
     "rapier": Entry(rapier_engine.Rapier, "rapier3d"),
+    "cgwm": Entry(own_engine.Own, "torch"),
 }
 """By name; `mujoco` is the truth of the older tables."""
+JUDGES = tuple(name for name in ENGINES if name != "cgwm")
+"""The engines that are not cgwm's own, which only an error budget takes as the truth."""
 
 
 def refusal(name: str, solid: SolidObject) -> str | None:

@@ -93,8 +93,27 @@ def recorded(
             stepper.move_fingertip(command[0][step], command[1][step])
         qpos[step], qvel[step] = stepper.state()
         stepper.advance()
+    return motion_of(qpos, qvel, solid, start, command)
+
+
+def motion_of(
+    qpos: Array, qvel: Array, solid: SolidObject, start: float, command: tuple[Array, Array] | None
+) -> Motion:
+    """Return the motion of an object, with that of its fingertip, from its states at every step.
+
+    Args:
+        qpos: Position [m] and quat_wxyz of the object, shape (step, 7).
+        qvel: Velocity of its origin [m/s] and omega_body [rad/s], shape (step, 6).
+        solid: The object.
+        start: Time of the first state [s].
+        command: Of the fingertip, as of `recorded`.
+
+    Raises:
+        ArithmeticError: If the motion is not finite.
+    """
     if not (np.isfinite(qpos).all() and np.isfinite(qvel).all()):
         raise ArithmeticError("the engine's motion is not finite")
+    count = len(qpos)
     touched = _struck(qvel, start) if command is not None else _landed(solid, qpos)
     first = start + int(touched.argmax()) * STEP_S if touched.any() else None
     if command is not None:

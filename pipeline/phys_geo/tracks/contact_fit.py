@@ -34,6 +34,7 @@ from ...optimization.importance_sampling import episode_covariance
 from ...physics.chain_parameters import chain_parameters
 from ...physics.effects import ActiveEffect, load_effect
 from ...physics.pair_laws import laws_in_use
+from ...physics.paper_law import PaperLaw
 from ...physics.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_TIME,
@@ -175,7 +176,7 @@ class _FitData:
     noise: Noise
     """Noise that the fit assumes, given or estimated: position [m], rotation [rad]."""
     bounces: RestitutionFit | None
-    """Restitution of the bounces of a ball, where its tracks have some."""
+    """Restitution of the bounces of a ball, where its tracks have some and the law has a damping ratio for it."""
     airborne: bool
     """Whether the only free body touches nothing in any of the frames."""
 
@@ -203,7 +204,7 @@ class _FitData:
             noise_estimated=estimated,
             noise=Noise(noise[0] or estimated[0], noise[1] or estimated[1]),
             bounces=None
-            if airborne or world.chains or len(laws_in_use(world).laws) > 1
+            if airborne or world.chains or len(laws_in_use(world).laws) > 1 or isinstance(world.contact, PaperLaw)
             else restitution_of(world, whole_episodes(world, episodes)),
             airborne=airborne,
         )

@@ -45,7 +45,7 @@ def values(*numbers: float) -> torch.Tensor:
         (
             world_of(
                 box_body(),
-                contact=PaperLaw(friction=values(0.3), stiffness_n_m=values(2e5), damping_n_s_m=values(10.0)),
+                contact=PaperLaw.of_rows(values(0.3), values(2e5), values(10.0)),
             ),
             r"step of 1 ms is beyond the bound of its contacts, 0.8 ms",
         ),

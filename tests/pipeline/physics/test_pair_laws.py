@@ -90,6 +90,6 @@ def test_laws_of_pairs_are_checked_as_the_others_are() -> None:
     assert largest_step(short) < largest_step(world)
     with pytest.raises(InputDataError, match="beyond the bound of its contacts"):
         require_physical(short)
-    published = PaperLaw(friction=batch(0.3), stiffness_n_m=batch(1e4), damping_n_s_m=batch(1.0))
+    published = PaperLaw.of_rows(batch(0.3), batch(1e4), batch(1.0))
     with pytest.raises(UsageError, match="'published' has no laws of pairs of materials"):
         require_physical(replace(short, contact=published))

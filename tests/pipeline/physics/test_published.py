@@ -15,9 +15,7 @@ MASS, STIFFNESS, DAMPING, MU, STEP = 0.4, 2000.0, 10.0, 0.5, 0.0005
 
 
 def law(**changes: object) -> PaperLaw:
-    return replace(
-        PaperLaw(friction=batch(MU), stiffness_n_m=batch(STIFFNESS), damping_n_s_m=batch(DAMPING)), **changes
-    )
+    return replace(PaperLaw.of_rows(batch(MU), batch(STIFFNESS), batch(DAMPING)), **changes)
 
 
 def test_it_rests_at_the_depth_of_its_formula() -> None:

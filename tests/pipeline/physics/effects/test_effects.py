@@ -629,7 +629,7 @@ def test_what_an_effect_needs_and_does_not_get_is_refused() -> None:
 
 
 def test_the_published_law_takes_effects_on_friction_alone() -> None:
-    published = PaperLaw(friction=batch(MU), stiffness_n_m=batch(2000.0), damping_n_s_m=batch(10.0))
+    published = PaperLaw.of_rows(batch(MU), batch(2000.0), batch(10.0))
     world = replace(world_of(box_body(half=FLAT)), contact=published)
     start = state_of(((0, 0, 0.0099), UP, (1, 0, 0), (0, 0, 0)))
     speeds = [

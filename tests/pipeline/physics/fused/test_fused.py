@@ -720,7 +720,7 @@ def test_what_the_kernel_does_not_have() -> None:
     assert "'other'" in (reason_against(replace(world, effects=(ActiveEffect.of(Other()),))) or "")
     flying = replace(world, touching=False, effects=(active("adhesion", F=1.0),))
     assert "do not touch anything" in (reason_against(flying) or "")
-    published = PaperLaw(friction=batch(0.3), stiffness_n_m=batch(1e4), damping_n_s_m=batch(10.0))
+    published = PaperLaw.of_rows(batch(0.3), batch(1e4), batch(10.0))
     assert "'published'" in (reason_against(replace(world, contact=published)) or "")
     assert "its bodies may have 16392 contacts" in (reason_against(crowded(8188)) or "")
 
