@@ -62,6 +62,7 @@ def _true(part: Part) -> tuple[str, Row]:
     return name, Row(lambda: TruePart(name, part))
 
 
+FLOOR = Floor.name
 FIXED = f"{REFERENCE}, geometry fixed"
 PUBLISHED = f"{REFERENCE}, contact_law=paper"
 
