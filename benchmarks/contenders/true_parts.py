@@ -95,7 +95,10 @@ def with_true_mass(model: Model, capture: Path) -> Model:
         else body
         for body in model.file.bodies
     )
-    return replace(model, file=model.file.model_copy(update={"bodies": changed}))
+    kept = tuple(p for p in model.file.parameters if not p.name.startswith(f"{OBJECT}."))
+    blocks = tuple(b for b in model.file.correlations if set(b.parameters) <= {p.name for p in kept})
+    update = {"bodies": changed, "parameters": kept, "correlations": blocks}
+    return replace(model, file=model.file.model_copy(update=update))
 
 
 def with_true_poses(source: Path, target: Path) -> None:
