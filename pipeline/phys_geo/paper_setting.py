@@ -1,4 +1,4 @@
-"""What a fit of the ContactGaussian-WM paper's contact law does not take, and how much longer it lasts."""
+"""The setting `phys-geo.contact_law=paper`: what a fit of that law does not take, and its cost."""
 
 from __future__ import annotations
 
@@ -10,30 +10,36 @@ from ...schemas import ModelFile, PhysConfig, UsageError
 SLOWER = 20
 """How many times longer a fit of the paper's law to a track takes on a CPU, since the kernels do not have it: 48 s
 against 2.4 s for a box that falls once."""
+_PARTS = ("mass_distribution", "length_scale")
 
 
-def require_paper_law(file: ModelFile, capture: Capture, config: PhysConfig) -> None:
-    """Refuse what the paper's law does not have: laws of pairs of materials, effects and jointed bodies; say its cost.
+def paper_config(file: ModelFile, capture: Capture, config: PhysConfig) -> PhysConfig:
+    """Return the settings of a fit of the paper's law, and say what it costs.
+
+    Mass distribution and scale are not chosen by windows about impacts, which assume our law.
+
+    Args:
+        file: The model from which the fit starts.
+        capture: The capture.
+        config: The settings as given.
 
     Raises:
         InputDataError: If a body has joints.
-        UsageError: If pairs of materials, or effects, are given.
+        UsageError: If laws of pairs of materials, effects or those parts are asked for.
     """
     setting = f"phys-geo.contact_law={config.contact_law}"
     refuse_joints(file.articulations, str(capture.root), f"fit with {setting}")
-    effects = [effect.name for effect in file.effects] + list(config.effects)
-    if effects:
+    manifest = capture.manifest
+    asked = [f"the effect '{name}'" for name in (*(effect.name for effect in file.effects), *config.effects)]
+    asked += [f"phys-geo.{name}=true" for name in _PARTS if getattr(config, name) is True]
+    asked += ["laws of pairs of materials"] if manifest.pairs or len(manifest.materials) > 1 else []
+    if asked:
         raise UsageError(
-            f"{setting} with the effect '{effects[0]}': the fit of effects assumes the law closed_form.",
-            "the paper's law without effects.",
-            f"leave out {setting}, or the effects.",
-        )
-    if capture.manifest.pairs or len(capture.manifest.materials) > 1:
-        raise UsageError(
-            f"{capture.root / 'capture.toml'}: {setting} with laws of pairs of materials: the paper has one for all.",
-            "captures without [[materials]] and [[pairs]].",
-            f"leave out {setting}, or the materials.",
+            f"{setting} with {asked[0]}: the paper has one law for all contacts, and fits beside it assume ours.",
+            "the paper's law alone.",
+            "leave out one of the two, or use phys-geo.contact_law=closed_form.",
         )
     note(
         f"phys-geo: the contact law 'paper' runs in the torch engine alone, some {SLOWER} times slower than the kernels"
     )
+    return config.model_copy(update=dict.fromkeys(_PARTS, False))

@@ -39,7 +39,7 @@ from ..segments.described_motion import not_described
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from .material_pairs import require_known_pairs, start_laws, with_pusher_law
-from .paper_setting import require_paper_law
+from .paper_setting import paper_config
 from .surface_starts import require_outside
 from .tracks.contact_result import PhysicsFit
 from .tracks.earlier_estimates import GROUND, EarlierEstimates
@@ -75,7 +75,7 @@ def fit_motion(
     if config.contact_law == "closed_form":
         capture = replace(capture, manifest=with_pusher_law(capture.manifest))
     else:
-        require_paper_law(model.file, capture, config)
+        config = paper_config(model.file, capture, config)
     ready = _with_surfaces(replace(model, file=_physics_start(model, capture, config)), capture)
     if config.supervise == "tracks":
         require_outside(World.from_model(ready), capture, split)

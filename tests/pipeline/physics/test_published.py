@@ -68,6 +68,24 @@ def test_its_impulses_stay_in_the_pyramid_and_soften_to_the_maximum() -> None:
     torch.testing.assert_close(soft.position_m, rollout.position_m[:, :11], atol=1e-4, rtol=0)
 
 
+def test_a_natural_time_and_a_damping_ratio_state_its_stiffness_and_damping() -> None:
+    stated = PaperLaw.of_body(batch(MU), batch(0.02), batch(0.7), MASS, 9.81 * MASS)
+    same = PaperLaw.of_rows(batch(MU), stated.stiffness_n_m, stated.damping_n_s_m)
+    assert float(stated.stiffness_n_m) == pytest.approx(MASS / (16 * 0.02**2))
+    assert float(same.stiffness_n_m) == pytest.approx(float(stated.stiffness_n_m))
+    assert float(same.damping_n_s_m) == pytest.approx(2 * 0.7 * MASS / (16 * 0.02))
+
+
+def test_as_published_a_box_on_four_corners_sinks_by_g_tau_squared() -> None:
+    """16 rows of K = m / (16 tau^2); with the clamp's offset taken off and its slope of 1, to second order in depth."""
+    time, depth = 0.005, 9.81 * 0.005**2
+    published = PaperLaw.of_body(batch(MU), batch(time), batch(1.0), MASS, 9.81 * MASS)
+    world = world_of(box_body(mass=MASS, radius=1e-6), contact=published, step_s=STEP)
+    rollout = simulate(world, state_of(((0, 0, 0.03), UP, (0, 0, 0), (0, 0, 0))), times(0.2, 10.0))
+    lift = STEP * 9.81 * (STEP + 2 * time)  # g h^2 + D g h / K
+    assert float(rollout.position_m[0, -1, 0, 2]) - 0.03 == pytest.approx(lift - depth, abs=0.1 * depth)
+
+
 def test_its_distance_lies_within_its_bounds() -> None:
     generator = torch.Generator().manual_seed(0)
     distances = 0.01 * torch.randn(50, 10, generator=generator, dtype=F64)

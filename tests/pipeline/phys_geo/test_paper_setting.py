@@ -1,0 +1,77 @@
+"""The contact law of the paper as a setting of the fit: what it gives, where it is recorded, what it refuses."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from cgwm.datasets.capture.capture import Capture
+from cgwm.datasets.models.mjcf import write_mjcf
+from cgwm.datasets.models.model import read_model, write_model
+from cgwm.pipeline.phys_geo.paper_setting import paper_config
+from cgwm.pipeline.physics import ContactLaw, PaperLaw, World
+from cgwm.pipeline.physics.parameters import apply_parameters, contact_parameters
+from cgwm.schemas import Body, CaptureManifest, Ground, InputDataError, Material, PhysConfig, UsageError
+from cgwm.schemas import World as Surroundings
+from helpers.small_model import MASS, small_model
+from pydantic import ValidationError
+
+PAPER = PhysConfig(contact_law="paper")
+
+
+def published():
+    """Return the small model with the paper's law."""
+    model = small_model()
+    solver = model.file.solver.model_copy(update={"contact_model": "paper"})
+    return replace(model, file=model.file.model_copy(update={"solver": solver}))
+
+
+def capture(*materials: Material) -> Capture:
+    """Return a capture of one body on a ground."""
+    manifest = CaptureManifest(
+        format="cgwm-capture/1",
+        world=Surroundings(ground=Ground()),
+        bodies=(Body(name="cube", mass_kg=1.0),),
+        materials=materials,
+    )
+    return Capture(root=Path("C"), manifest=manifest, cameras=None)
+
+
+def test_the_model_records_the_law_and_its_world_has_it(tmp_path: Path) -> None:
+    write_model(tmp_path / "m", published())
+    world, ours = World.from_model(read_model(tmp_path / "m")), World.from_model(small_model())
+    assert isinstance(world.contact, PaperLaw) and isinstance(ours.contact, ContactLaw)
+    assert float(world.contact.stiffness_n_m) == pytest.approx(MASS / (16 * 0.008**2))
+    assert world.bodies[0].on_plane is None and ours.bodies[0].on_plane is not None  # every sphere counts
+
+
+def test_its_numbers_are_fitted_by_the_names_of_ours() -> None:
+    world = World.from_model(published())
+    parameters = contact_parameters(world)
+    assert [p.name for p in parameters] == ["friction", "contact_time_s", "damping_ratio"]
+    assert [p.prior[0] for p in parameters[1:]] == [0.02, 1.0]
+    law = apply_parameters(world, parameters, torch.tensor([[0.2, 0.01, 0.5]], dtype=torch.float64)).contact
+    assert isinstance(law, PaperLaw)
+    assert float(law.damping_n_s_m) == pytest.approx(2 * 0.5 * MASS / (16 * 0.01))
+
+
+def test_parts_that_assume_our_law_are_left_out_or_refused() -> None:
+    assert paper_config(small_model().file, capture(), PAPER).mass_distribution is False
+    two = (Material(name="steel", friction=0.2), Material(name="wood", friction=0.4))
+    for given, change, named in (
+        (capture(), {"effects": ("linear_drag",)}, "the effect 'linear_drag'"),
+        (capture(), {"length_scale": True}, "phys-geo.length_scale=true"),
+        (capture(*two), {}, "laws of pairs of materials"),
+    ):
+        with pytest.raises(UsageError, match=f"phys-geo.contact_law=paper with {named}: the paper has one law"):
+            paper_config(small_model().file, given, PAPER.model_copy(update=change))
+
+
+def test_an_unknown_law_is_refused_with_the_two_there_are() -> None:
+    with pytest.raises(ValidationError, match="'closed_form' or 'paper'"):
+        PhysConfig.model_validate({"contact_law": "published"})
+
+
+def test_what_knows_our_law_alone_refuses_it() -> None:
+    with pytest.raises(InputDataError, match="contact law 'paper', which MJCF does not take"):
+        write_mjcf(published())
