@@ -288,11 +288,13 @@ class World:
         ]
 
         def law_of(numbers: ContactParameters) -> ContactLaw | PaperLaw:
-            values = [tensor(v) for v in (numbers.friction, numbers.contact_time_s, numbers.damping_ratio)]
+            friction, time, ratio = (
+                tensor(v) for v in (numbers.friction, numbers.contact_time_s, numbers.damping_ratio)
+            )
             if file.solver.contact_model == "closed_form":
-                return ContactLaw(*values)
+                return ContactLaw(friction, time, ratio)
             mass = min(body.mass_kg for body in file.bodies if body.motion == "free")
-            return PaperLaw.of_body(*values, mass, mass * float(np.linalg.norm(file.gravity_m_s2)))
+            return PaperLaw.of_body(friction, time, ratio, mass, mass * float(np.linalg.norm(file.gravity_m_s2)))
 
         ground = file.ground
         world = World(
