@@ -113,9 +113,10 @@ class Hold:
         return Solution(torch.zeros_like(warm), 0.0)
 
 
-def measure(name: str, task: HandTask, seed: int, clock: str) -> dict[str, Any]:
+def measure(name: str, task: HandTask, seed: int, clock: str, device: str) -> dict[str, Any]:
     """Return the figures of one run."""
-    controller = HandController(cube(), task, "mppi" if name == "hold" else name)  # pyright: ignore[reportArgumentType]
+    solver = "mppi" if name == "hold" else name
+    controller = HandController(cube(), task, solver, device=device)  # pyright: ignore[reportArgumentType]
     if name == "hold":
         controller._solver = Hold()
     if clock == "cpu":
@@ -171,6 +172,7 @@ def main() -> None:
     parser.add_argument("--corners", type=int, default=12, help="of a link's shape")
     parser.add_argument("--horizon", type=float, default=1.0)
     parser.add_argument("--step", type=float, default=0.02)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the predictions")
     parser.add_argument("--store", type=Path, default=None)
     parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
     given = parser.parse_args()
@@ -187,8 +189,9 @@ def main() -> None:
         task = task_in(Path(folder), given.scene, given)
         for seed in range(given.seeds):
             for name in given.contenders.split(","):
-                key = f"{name}, {given.clock}, {given.hz:g} Hz, {given.samples} x {given.horizon:g} s/{seed}"
-                store.result(key, lambda n=name, s=seed: measure(n, task, s, given.clock))
+                size = f"{given.samples} x {given.horizon:g} s in steps of {1e3 * given.step:g} ms"
+                key = f"{name}, {given.clock}, {given.hz:g} Hz, {size}, {given.device}/{seed}"
+                store.result(key, lambda n=name, s=seed: measure(n, task, s, given.clock, given.device))
 
 
 if __name__ == "__main__":

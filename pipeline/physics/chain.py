@@ -117,6 +117,24 @@ class Joint:
 
 
 @dataclass(frozen=True, kw_only=True)
+class JointFrames:
+    """Frames, axes and kinds of the joints of a chain, in one tensor each; every batch dimension is 1 or B."""
+
+    position: Tensor
+    """As `Joint.position`, shape (B, joints, 3)."""
+    quat_wxyz: Tensor
+    """As `Joint.quat_wxyz`, shape (B, joints, 4)."""
+    axis: Tensor
+    """As `Joint.axis`, shape (B, joints, 3)."""
+    middle: Tensor
+    """Middle of the limits [rad or m], 0 for none, without derivatives, shape (B, joints)."""
+    slides: Tensor
+    """Whether each is a slide, shape (joints,)."""
+    turns: Tensor
+    """Whether each is a hinge, shape (joints,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Chain:
     """Links joined in a tree."""
 
@@ -165,23 +183,42 @@ class Chain:
             rows.append(tuple(row))
         return tuple(rows)
 
+    @cached_property
+    def frames(self) -> JointFrames:
+        """Frames, axes and kinds of all joints."""
+        middles = [(0.5 * (joint.lower + joint.upper)).detach() for joint in self.joints]
+        kinds = [joint.kind for joint in self.joints]
+        device = self.joints[0].axis.device
+        return JointFrames(
+            position=_side_by_side([joint.position for joint in self.joints]),
+            quat_wxyz=_side_by_side([joint.quat_wxyz for joint in self.joints]),
+            axis=_side_by_side([joint.axis for joint in self.joints]),
+            middle=_side_by_side([torch.where(torch.isfinite(x), x, torch.zeros_like(x)) for x in middles]),
+            slides=torch.tensor([kind == "slide" for kind in kinds], device=device),
+            turns=torch.tensor([kind == "hinge" for kind in kinds], device=device),
+        )
+
     def moves(self, link: str) -> bool:
         """Return whether a joint, or the free root, moves a link."""
         return self.base == "free" or any(self.above[self.links.index(link)])
 
     def numbers(self, name: str) -> Tensor:
         """Return a coefficient of all moving joints, shape (1 or B, joints)."""
-        values = [getattr(joint, name) for joint in self.moving]
-        batch = max(value.shape[0] for value in values)
-        return torch.stack([value.expand(batch) for value in values], -1)
+        return _side_by_side([getattr(joint, name) for joint in self.moving])
 
-    def place(self, joint: Joint, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Return position (B, 3) [m] and quaternion (B, 4) of a link's frame in its parent's at a joint value (B,)."""
-        if joint.kind == "hinge":
-            return joint.position, quat_multiply(joint.quat_wxyz, quat_exp(joint.axis * value[:, None]))
-        if joint.kind == "slide":
-            return joint.position + quat_rotate(joint.quat_wxyz, joint.axis * value[:, None]), joint.quat_wxyz
-        return joint.position, joint.quat_wxyz
+    @cached_property
+    def generations(self) -> tuple[tuple[list[int], list[int]], ...]:
+        """Places in `links` of links with equally many ancestors, and of their parents; children of the root first."""
+        depth = [0]
+        for parent in self.parents[1:]:
+            depth.append(depth[parent] + 1)
+        rows = [[k for k, ancestors in enumerate(depth) if ancestors == d] for d in range(1, max(depth) + 1)]
+        return tuple((row, [self.parents[k] for k in row]) for row in rows)
+
+    def in_links(self, values: Tensor) -> Tensor:
+        """Return numbers (B, joints) of the moving joints by joint, (B, all joints), 0 for fixed ones."""
+        padded = torch.nn.functional.pad(values, (0, 1))
+        return padded[:, [column if column >= 0 else values.shape[1] for column in self.columns[1:]]]
 
     def poses(self, position: Tensor, quat: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return the poses of all links: positions (B, L, 3) [m] and quaternions (B, L, 4).
@@ -191,14 +228,28 @@ class Chain:
             quat: Orientation of the root, shape (B, 4).
             values: Values of the moving joints [rad or m], shape (B, joints).
         """
-        batch = max(position.shape[0], values.shape[0], *(j.position.shape[0] for j in self.joints), 1)
-        positions, quats = [position.expand(batch, 3)], [quat.expand(batch, 4)]
-        for joint, parent, column in zip(self.joints, self.parents[1:], self.columns[1:], strict=True):
-            value = values[:, column] if column >= 0 else values.new_zeros(1)
-            offset, turn = self.place(joint, value)
-            positions.append(positions[parent] + quat_rotate(quats[parent], offset))
-            quats.append(quat_multiply(quats[parent], turn).expand(batch, 4))
+        frames, every = self.frames, self.in_links(values)[..., None]
+        moved = torch.where(frames.slides[:, None], frames.axis * every, torch.zeros_like(every))
+        turned = torch.where(frames.turns[:, None], frames.axis * every, torch.zeros_like(every))
+        offset = frames.position + quat_rotate(frames.quat_wxyz, moved)
+        turn = quat_multiply(frames.quat_wxyz, quat_exp(turned))
+        batch = max(position.shape[0], quat.shape[0], offset.shape[0], turn.shape[0])
+        positions = [position.expand(batch, 3)] * len(self.links)
+        quats = [quat.expand(batch, 4)] * len(self.links)
+        for rows, parents in self.generations:
+            above = torch.stack([quats[k] for k in parents], 1)
+            own = [k - 1 for k in rows]
+            place = torch.stack([positions[k] for k in parents], 1) + quat_rotate(above, offset[:, own])
+            orientation = quat_multiply(above, turn[:, own])
+            for number, row in enumerate(rows):
+                positions[row], quats[row] = place[:, number], orientation[:, number]
         return torch.stack(positions, 1), torch.stack(quats, 1)
+
+
+def _side_by_side(values: Sequence[Tensor]) -> Tensor:
+    """Return numbers of several joints (1 or B, ...) in one tensor (1 or B, joints, ...)."""
+    batch = max(value.shape[0] for value in values)
+    return torch.stack([value.expand(batch, *value.shape[1:]) for value in values], 1)
 
 
 def chain_of_model(entry: ArticulationModel, like: Tensor) -> Chain:
@@ -238,15 +289,19 @@ def link_velocities(
         root: Velocity of the root's origin [m/s] and its angular velocity [rad/s], world frame, shape (B, 3) each.
         speeds: Speeds of the moving joints, shape (B, joints).
     """
-    linear, omega = [root[0].expand_as(position[:, 0])], [root[1].expand_as(position[:, 0])]
-    for k, (joint, parent, column) in enumerate(
-        zip(chain.joints, chain.parents[1:], chain.columns[1:], strict=True), 1
-    ):
-        velocity = linear[parent] + cross(omega[parent], position[:, k] - position[:, parent])
-        spin = omega[parent]
-        if column >= 0:
-            along = quat_rotate(quat[:, k], joint.axis) * speeds[:, column, None]
-            velocity, spin = (velocity, spin + along) if joint.kind == "hinge" else (velocity + along, spin)
-        linear.append(velocity)
-        omega.append(spin)
+    frames, every = chain.frames, chain.in_links(speeds)[..., None]
+    along = quat_rotate(quat[:, 1:], frames.axis) * every
+    zero = torch.zeros_like(along)
+    sliding = torch.where(frames.slides[:, None], along, zero)
+    turning = torch.where(frames.turns[:, None], along, zero)
+    linear = [root[0].expand_as(position[:, 0])] * len(chain.links)
+    omega = [root[1].expand_as(position[:, 0])] * len(chain.links)
+    for rows, parents in chain.generations:
+        own = [k - 1 for k in rows]
+        above = torch.stack([omega[k] for k in parents], 1)
+        carried = torch.stack([linear[k] for k in parents], 1)
+        carried = carried + cross(above, position[:, rows] - position[:, parents]) + sliding[:, own]
+        spin = above + turning[:, own]
+        for number, row in enumerate(rows):
+            linear[row], omega[row] = carried[:, number], spin[:, number]
     return torch.stack(linear, 1), torch.stack(omega, 1)

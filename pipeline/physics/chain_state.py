@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...schemas import InputDataError, UsageError
 from ..geometry.rotation import cross, quat_conjugate, quat_exp, quat_multiply, quat_rotate
-from .chain import BASES, Chain, Joint, link_velocities
+from .chain import BASES, Chain, JointFrames, link_velocities
 from .world import Body, State, World
 
 OFF_JOINT_M, OFF_JOINT_RAD = 1e-5, 1e-4
@@ -117,63 +117,56 @@ def joint_values(names: Sequence[str], state: State, chain: Chain, exact: bool =
     Raises:
         InputDataError: If a link is not where its joint admits it, with the environment.
     """
-    rows = [names.index(name) for name in chain.links]
-    values, speeds = [], []
-    for joint, row, up in zip(chain.joints, rows[1:], chain.parents[1:], strict=True):
-        parent = rows[up]
-        position, quat, velocity = (x[:, row] for x in (state.position_m, state.quat_wxyz, state.velocity_m_s))
-        above, turn = state.position_m[:, parent], state.quat_wxyz[:, parent]
-        offset = quat_rotate(quat_conjugate(turn), position - above) - joint.position
-        turned = quat_multiply(quat_conjugate(joint.quat_wxyz), quat_multiply(quat_conjugate(turn), quat))
-        value = _value(joint, offset, turned)
-        if exact:
-            _require_joint(joint, offset, turned, value)
-        if joint.kind == "fixed":
-            continue
-        omega = quat_rotate(turn, state.omega_body_rad_s[:, parent])
-        axis = quat_rotate(quat, joint.axis)
-        if joint.kind == "hinge":
-            speed = (axis * (quat_rotate(quat, state.omega_body_rad_s[:, row]) - omega)).sum(-1)
-        else:
-            carried = state.velocity_m_s[:, parent] + cross(omega, position - above)
-            speed = (axis * (velocity - carried)).sum(-1)
-        values.append(value)
-        speeds.append(speed)
-    if not values:
+    if not chain.moving:
         nothing = state.position_m.new_zeros(state.position_m.shape[0], 0)
         return nothing, nothing
-    return torch.stack(values, -1), torch.stack(speeds, -1)
+    rows = [names.index(name) for name in chain.links]
+    child, parent = rows[1:], [rows[up] for up in chain.parents[1:]]
+    position, quat, velocity, omega_body = (x[:, child] for x in state.tensors)
+    above, turn, carrier, carrier_omega = (x[:, parent] for x in state.tensors)
+    away, back = position - above, quat_conjugate(turn)
+    joints = chain.frames
+    offset = quat_rotate(back, away) - joints.position
+    turned = quat_multiply(quat_conjugate(joints.quat_wxyz), quat_multiply(back, quat))
+    value = _values(joints, offset, turned)
+    if exact:
+        _require_joints(chain, offset, turned, value)
+    omega, axis = quat_rotate(turn, carrier_omega), quat_rotate(quat, joints.axis)
+    turning = (axis * (quat_rotate(quat, omega_body) - omega)).sum(-1)
+    sliding = (axis * (velocity - carrier - cross(omega, away))).sum(-1)
+    speed = torch.where(joints.slides, sliding, turning)
+    moving = [k for k, joint in enumerate(chain.joints) if joint.kind != "fixed"]
+    return value[:, moving], speed[:, moving]
 
 
-def _value(joint: Joint, offset: Tensor, turned: Tensor) -> Tensor:
-    """Return the value (B,) of a joint from the link's offset and turn against its place at value 0."""
-    if joint.kind == "slide":
-        return (quat_rotate(joint.quat_wxyz, joint.axis) * offset).sum(-1)
-    along = (turned[:, 1:] * joint.axis).sum(-1)
-    value = 2 * torch.atan2(along, turned[:, 0])
-    middle = 0.5 * (joint.lower + joint.upper)
-    middle = torch.where(torch.isfinite(middle), middle, torch.zeros_like(middle)).detach()
-    return value - 2 * math.pi * torch.round((value.detach() - middle) / (2 * math.pi))
+def _values(joints: JointFrames, offset: Tensor, turned: Tensor) -> Tensor:
+    """Return the values (B, joints) of joints from the links' offsets and turns against their places at value 0."""
+    along = (turned[..., 1:] * joints.axis).sum(-1)
+    angle = 2 * torch.atan2(along, turned[..., 0])
+    angle = angle - 2 * math.pi * torch.round((angle.detach() - joints.middle) / (2 * math.pi))
+    return torch.where(joints.slides, (quat_rotate(joints.quat_wxyz, joints.axis) * offset).sum(-1), angle)
 
 
-def _require_joint(joint: Joint, offset: Tensor, turned: Tensor, value: Tensor) -> None:
-    with torch.no_grad():
-        if joint.kind == "slide":
-            offset = offset - quat_rotate(joint.quat_wxyz, joint.axis) * value[:, None]
-        elif joint.kind == "hinge":
-            turned = quat_multiply(turned, quat_exp(-joint.axis * value[:, None]))
-        far = offset.square().sum(-1).sqrt() / OFF_JOINT_M
-        angle = 2 * turned[:, 1:].square().sum(-1).sqrt() / OFF_JOINT_RAD
-        wrong = ((far > 1) | (angle > 1)).nonzero()
-        if len(wrong):
-            item = int(wrong[0, 0])
-            raise InputDataError(
-                f"the start of environment {item}: link '{joint.link}' is "
-                f"{1e3 * OFF_JOINT_M * float(far[item]):.3g} mm and "
-                f"{OFF_JOINT_RAD * float(angle[item]):.3g} rad off its joint '{joint.name}'.",
-                f"up to {1e3 * OFF_JOINT_M:g} mm and {OFF_JOINT_RAD:g} rad.",
-                "make the start with with_joints.",
-            )
+@torch.no_grad()
+def _require_joints(chain: Chain, offset: Tensor, turned: Tensor, value: Tensor) -> None:
+    joints = chain.frames
+    slid = quat_rotate(joints.quat_wxyz, joints.axis) * value[..., None]
+    offset = torch.where(joints.slides[:, None], offset - slid, offset)
+    unturned = quat_multiply(turned, quat_exp(-joints.axis * value[..., None]))
+    turned = torch.where(joints.turns[:, None], unturned, turned)
+    far = offset.square().sum(-1).sqrt() / OFF_JOINT_M
+    angle = 2 * turned[..., 1:].square().sum(-1).sqrt() / OFF_JOINT_RAD
+    wrong = ((far > 1) | (angle > 1)).T.nonzero()
+    if len(wrong):
+        number, item = wrong[0].tolist()
+        joint = chain.joints[number]
+        raise InputDataError(
+            f"the start of environment {item}: link '{joint.link}' is "
+            f"{1e3 * OFF_JOINT_M * float(far[item, number]):.3g} mm and "
+            f"{OFF_JOINT_RAD * float(angle[item, number]):.3g} rad off its joint '{joint.name}'.",
+            f"up to {1e3 * OFF_JOINT_M:g} mm and {OFF_JOINT_RAD:g} rad.",
+            "make the start with with_joints.",
+        )
 
 
 def with_joints(

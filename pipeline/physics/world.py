@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 import torch
@@ -27,6 +28,8 @@ from .smooth_distance import plane_contacts
 if TYPE_CHECKING:
     from ...datasets.models.model import Model
     from ...schemas import BodyModel, ContactParameters, EffectModel
+
+T = TypeVar("T")
 
 MOST_STEPS = 2_000_000_000
 """Maximum number of steps of a rollout: some hours; the kernels count them in 32 bits."""
@@ -128,6 +131,13 @@ class World:
         """Return what messages call a part of the world: with the file that it comes from."""
         return f"{self.source}: {what}" if self.source else what
 
+    def once(self, make: Callable[[World], T]) -> T:
+        """Return `make(self)`, made at the first call and kept with the world; for what depends on nothing else."""
+        kept: dict[object, object] = self.__dict__.setdefault("_kept", {})
+        if make not in kept:
+            kept[make] = make(self)
+        return cast(T, kept[make])
+
     @property
     def body_names(self) -> list[str]:
         """Names of the bodies, in the order of the state."""
@@ -197,7 +207,7 @@ class World:
             )
         return [max(1, math.ceil(length / self.step_s - 1e-6)) for length in longest]
 
-    @property
+    @cached_property
     def pairs(self) -> list[tuple[int, int]]:
         """The pairs that can touch: each free body with the ground (-1), fixed surfaces (-2, ...) and other bodies.
 

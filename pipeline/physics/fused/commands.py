@@ -46,15 +46,15 @@ class Commands:
         """All tensors."""
         return [tensor for row in self.rows for tensor in row]
 
-    def samples(self, batch: int, like: Tensor) -> Tensor:
+    def samples(self, like: Tensor) -> Tensor:
         """Return the samples of all commands in one tensor."""
-        return joined([row for row, _ in self.rows], batch) if self.rows else like.new_zeros(1, 0, 14)
+        return joined([row for row, _ in self.rows]) if self.rows else like.new_zeros(1, 0, 14)
 
-    def last(self, batch: int, like: Tensor) -> Tensor:
+    def last(self, like: Tensor) -> Tensor:
         """Return the index of the last interval of each command, int32, shape (1 or B, commands)."""
         if not self.rows:
             return like.new_zeros(1, 0)
-        return joined([last[:, None] for _, last in self.rows], batch).to(torch.int32)
+        return joined([last[:, None] for _, last in self.rows]).to(torch.int32)
 
     def starts(self, like: Tensor) -> Tensor:
         """Return the first sample of each command, int32, shape (commands,)."""

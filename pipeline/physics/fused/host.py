@@ -52,7 +52,7 @@ def lacking(world: World) -> str | None:
         return f"its tensors are on the device '{world.gravity.device.type}', not on the CPU"
     if compiler() is None:
         return NO_COMPILER
-    return reason_against(world) or _trial()
+    return world.once(reason_against) or _trial()
 
 
 def simulate_on_host(

@@ -8,10 +8,10 @@ from torch import Tensor
 from ...geometry.rotation import quat_multiply, quat_normalize, quat_rotate
 
 
-def joined(parts: list[Tensor], batch: int) -> Tensor:
-    """Concatenate along the second dimension; the first is 1 where it is 1 for all parts, else the batch."""
-    shared = all(part.shape[0] == 1 for part in parts)
-    return torch.cat([part if shared else part.expand(batch, *part.shape[1:]) for part in parts], 1)
+def joined(parts: list[Tensor]) -> Tensor:
+    """Concatenate parts (1 or B, N, ...) along the second dimension; the first is 1 where it is 1 for all parts."""
+    batch = max(len(part) for part in parts)
+    return torch.cat([part.expand(batch, *part.shape[1:]) for part in parts], 1)
 
 
 def upright(normal: Tensor) -> Tensor | None:

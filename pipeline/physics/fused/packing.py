@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -20,7 +20,7 @@ from ..world import Body, State, World
 from . import tree, wrenches
 from .commands import Commands
 from .layout import in_frame, joined, quat_in_frame, upright
-from .meshes import packed_meshes
+from .meshes import PackedMeshes, packed_meshes
 from .structure import Structure
 
 if TYPE_CHECKING:
@@ -98,80 +98,102 @@ def pack(
     Raises:
         InputDataError: If a driven body has no track.
     """
-    turn = None if world.ground_normal is None else upright(world.ground_normal)
+    fixed = world.once(_fixed)
+    turn, effects = fixed.turn, fixed.effects
     times = times_s if times_s.ndim == 2 else times_s[None]
     commands = Commands.of(world, driven, state.position_m.detach(), turn)
-    effects = wrenches.coefficients(world)
-    turned = turn is not None and (len(world.bodies) > 1 or bool(world.surfaces))
-    columns = _columns(world, state, turn, turned, effects)
-    spheres = [_spheres(body) for body in world.bodies]
-    surfaces = [_surface(surface, turn) for surface in world.surfaces]
+    columns = _columns(world, state, turn, fixed.structure.turned, effects)
     counts = torch.tensor(world.substeps(times), dtype=torch.int32, device=times.device)
     steps = _steps(wrenches.closed_forms(world), times, counts)
-    batch = max(len(x) for x in (*columns, *spheres, *surfaces, steps, *commands.tensors))
-    listed, lowest = _listed_spheres(world)
-    meshes = packed_meshes(world.surfaces)
-    hulls = [row for body in world.bodies for row in _hull_rows(body)]
+    batch = max(len(x) for x in (*columns, fixed.geometry, fixed.surfaces, steps, *commands.tensors))
     return Packed(
-        structure=_structure(
-            world,
+        structure=replace(
+            fixed.structure,
             record=record,
-            effects=bool(effects),
-            turned=turned,
-            driven=commands.bodies,
-            lowest=lowest,
-            mesh_starts=meshes.starts,
-            commanded=commands.chains,
+            drives=tuple(commands.bodies.index(k) if k in commands.bodies else -1 for k in range(len(world.bodies))),
+            tree=tree.tree_of(world, len(commands.bodies), commands.chains) if world.chains else None,
         ),
         table=torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
         steps=steps,
-        geometry=joined([*spheres, *hulls, *_patch_rows(world)], batch),
-        surfaces=joined(surfaces, batch) if surfaces else times.new_zeros(1, 0, 10),
-        mesh_numbers=meshes.numbers.to(times),
-        mesh_indices=meshes.indices.to(times.device),
-        drives=commands.samples(batch, times),
+        geometry=fixed.geometry,
+        surfaces=fixed.surfaces,
+        mesh_numbers=fixed.meshes.numbers.to(times),
+        mesh_indices=fixed.meshes.indices.to(times.device),
+        drives=commands.samples(times),
         substeps=counts,
-        spheres=listed,
+        spheres=fixed.spheres,
         drive_starts=commands.starts(times),
-        drive_last=commands.last(batch, counts),
+        drive_last=commands.last(counts),
         turn=turn,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Fixed:
+    """What of the inputs depends on the world alone."""
+
+    turn: Tensor | None
+    """As in `Packed`."""
+    effects: list[Tensor]
+    """Columns of the effects' coefficients."""
+    geometry: Tensor
+    """As in `Packed`."""
+    surfaces: Tensor
+    """As in `Packed`."""
+    spheres: Tensor
+    """As in `Packed`."""
+    meshes: PackedMeshes
+    """Meshes of the surfaces."""
+    structure: Structure
+    """Constants of the kernel, for one thread per environment, without records, commands, chains and derivatives."""
+
+
+def _fixed(world: World) -> _Fixed:
+    turn = None if world.ground_normal is None else upright(world.ground_normal)
+    hulls = [row for body in world.bodies for row in _hull_rows(body)]
+    surfaces = [_surface(surface, turn) for surface in world.surfaces]
+    listed, lowest = _listed_spheres(world)
+    effects, meshes = wrenches.coefficients(world), packed_meshes(world.surfaces)
+    turned = turn is not None and (len(world.bodies) > 1 or bool(world.surfaces))
+    return _Fixed(
+        turn=turn,
+        effects=effects,
+        geometry=joined([*map(_spheres, world.bodies), *hulls, *_patch_rows(world)]),
+        surfaces=joined(surfaces) if surfaces else world.gravity.new_zeros(1, 0, 10),
+        spheres=listed,
+        meshes=meshes,
+        structure=_structure(world, effects=bool(effects), turned=turned, lowest=lowest, mesh_starts=meshes.starts),
     )
 
 
 def _structure(
     world: World,
     *,
-    record: bool,
     effects: bool,
     turned: bool,
-    driven: list[int],
     lowest: tuple[tuple[int, int], ...],
     mesh_starts: tuple[tuple[int, int], ...],
-    commanded: list[int],
 ) -> Structure:
-    """Return the constants of the kernel, for one thread per environment and without derivatives.
+    """Return what of the constants of the kernel depends on the world alone.
 
     Args:
         world: The world.
-        record: Whether contacts are recorded.
         effects: Whether effects have coefficients in the table.
         turned: Whether the rotation of the kernel's frame is in the table.
-        driven: Indices of the driven bodies.
         lowest: First row and number of the candidates for the lowest sphere of each body.
         mesh_starts: First number and index of each surface's mesh.
-        commanded: Numbers of the chains whose joints have a command.
     """
     return Structure(
         single=world.gravity.dtype == torch.float32,
         dual=False,
         lanes=1,
-        record=record,
+        record=False,
         effects=effects,
         magnets=wrenches.magnets(world),
         twisted=wrenches.is_twisted(world),
         turned=turned,
         free=tuple(body.free for body in world.bodies),
-        drives=tuple(driven.index(index) if index in driven else -1 for index in range(len(world.bodies))),
+        drives=(-1,) * len(world.bodies),
         spheres=tuple(body.radii.shape[-1] for body in world.bodies),
         pairs=tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world)),
         laws=_law_numbers(world),
@@ -182,7 +204,6 @@ def _structure(
         mesh_starts=mesh_starts,
         surface=wrenches.has_surface(world),
         elliptic=wrenches.has_ellipse(world),
-        tree=tree.tree_of(world, len(driven), commanded) if world.chains else None,
     )
 
 

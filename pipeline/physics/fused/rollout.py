@@ -38,7 +38,7 @@ def unsupported(world: World) -> str | None:
         return f"its tensors are on the device '{world.gravity.device.type}', not on CUDA"
     if not kernel_build.available():
         return str(kernel_build.unavailable())
-    return reason_against(world)
+    return world.once(reason_against)
 
 
 def simulate_fused(
@@ -90,7 +90,7 @@ def roll(
 ) -> Rollout:
     """Check and pack the arguments of `simulate_fused`, run the kernel by `run`, and return the rollout."""
     require_one_kind(world.gravity, *vars(state).values(), times_s)
-    require_physical(world)
+    world.once(require_physical)
     require_state(state, world.body_names)
     world = changed_by_effects(world)
     if world.effects:

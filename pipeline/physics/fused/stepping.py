@@ -71,7 +71,7 @@ class FusedStepper:
         resident = self._started()
         if resident.sent.numel() > 0:
             commands = Commands.of(self._world, drives, resident.sent, resident.turn)
-            resident.sent.copy_(commands.samples(1, resident.sent))
+            resident.sent.copy_(commands.samples(resident.sent))
             resident.packed.drives.copy_(resident.sent, non_blocking=True)
 
     def advance(self) -> State:

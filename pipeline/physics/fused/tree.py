@@ -140,23 +140,39 @@ def _append(rows: dict[str, list], world: World, chain: Chain) -> None:
 
 def columns(world: World, state: State) -> list[Tensor]:
     """Return the columns of the chains: those of all links, then those of all moving joints."""
-    links, joints = [], []
-    zero = state.position_m.new_zeros(1, 1)
-    for chain in world.chains:
-        for place, name in enumerate(chain.links):
-            body = world.bodies[world.body_names.index(name)]
-            if place:
-                joint = chain.joints[place - 1]
-                links += [joint.position, joint.quat_wxyz, joint.axis]
-            else:
-                links += [zero.expand(1, 3), zero + zero.new_tensor([[1.0, 0.0, 0.0, 0.0]]), zero.expand(1, 3)]
-            inertia = body.inertia.flatten(1)
-            links += [body.mass[:, None], torch.cat([inertia[:, k : k + 1] for k in (0, 4, 8, 1, 2, 5)], -1), body.com]
+    joints = []
+    for chain, (_, numbers) in zip(world.chains, world.once(_fixed_columns), strict=True):
         values, speeds = joints_of(world, state, chain)
-        for k, joint in enumerate(chain.moving):
-            joints += [getattr(joint, name)[:, None] for name in _NUMBERS]
-            joints += [values[:, k : k + 1], speeds[:, k : k + 1]]
-    return [*links, *joints]
+        batch = max(len(numbers), len(values))
+        parts = (numbers.expand(batch, -1, -1), *(x.expand(batch, -1)[..., None] for x in (values, speeds)))
+        joints.append(torch.cat(parts, -1).flatten(1))
+    return [*(links for links, _ in world.once(_fixed_columns)), *joints]
+
+
+def _fixed_columns(world: World) -> list[tuple[Tensor, Tensor]]:
+    """Return by chain the columns of its links (1 or B, columns), and its joints' numbers (1 or B, joints, 7)."""
+    return [(_link_columns(world, chain), _joint_numbers(chain)) for chain in world.chains]
+
+
+def _link_columns(world: World, chain: Chain) -> Tensor:
+    bodies = [world.bodies[world.body_names.index(name)] for name in chain.links]
+    like = bodies[0].mass
+    upright, still = like.new_tensor([[1.0, 0.0, 0.0, 0.0]]), like.new_zeros(1, 3)
+    places = [(still, upright, still), *((joint.position, joint.quat_wxyz, joint.axis) for joint in chain.joints)]
+    parts = []
+    for body, place in zip(bodies, places, strict=True):
+        inertia = body.inertia.flatten(1)[:, (0, 4, 8, 1, 2, 5)]
+        parts += [*place, body.mass[:, None], inertia, body.com]
+    batch = max(map(len, parts))
+    return torch.cat([part.expand(batch, -1) for part in parts], -1)
+
+
+def _joint_numbers(chain: Chain) -> Tensor:
+    if not chain.moving:
+        return chain.joints[0].lower.new_zeros(1, 0, len(_NUMBERS))
+    columns = [chain.numbers(name) for name in _NUMBERS]
+    batch = max(map(len, columns))
+    return torch.stack([column.expand(batch, -1) for column in columns], -1)
 
 
 def link_motion(world: World, index: int, state: State) -> tuple[Tensor, Tensor]:
