@@ -13,6 +13,7 @@ residuals. Takes some seconds, on one core.
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -370,6 +371,7 @@ def solve(case: Case) -> dict[str, Count | None]:
 
 def main() -> None:
     """Print the table."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     torch.set_num_threads(1)
     print("| problem | " + " | ".join(METHODS) + " |")
     print("| --- |" + " --- |" * len(METHODS))

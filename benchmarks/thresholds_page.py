@@ -7,6 +7,7 @@ left as it is.
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 from dataclasses import fields
@@ -55,6 +56,7 @@ def page(text: str) -> str:
 
 def main() -> int:
     """Write the page."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
     count = len(re.findall("<!-- thresholds:", PAGE.read_text(encoding="utf-8")))
     print(f"{PAGE}: {count} tables written")

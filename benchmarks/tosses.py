@@ -10,6 +10,7 @@ error that is left (`toss_account.py`). Nothing is chosen on the test tosses.
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 import time
@@ -142,6 +143,7 @@ def compared(row: dict[str, Any], other: dict[str, Any]) -> str:
 
 def main() -> int:
     """Print one JSON line a stage and a table; return 1 if a figure misses its bar."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     data = shared_data()
     if data is None:
         print("no measured data: set CGWM_SHARED_DATA", file=sys.stderr)
