@@ -45,6 +45,8 @@ from tabletop.objects import load_item
 TESTS = 10
 ENGINE = "mujoco"
 """The engine of the older results."""
+UNABLE = {("tip", "mug")}
+"""Task and object for which no motion serves: of 400 pushes none topples the mug, whatever the engine."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +185,7 @@ def run(
 
 
 def drawn(names: dict[str, Sequence[str]], captures: int | None) -> list[tuple[str, str, str, str]]:
-    """Return task, object, material and engine of every capture, without those that the engine cannot simulate.
+    """Return task, object, material and engine of every capture, without what the engine or the task cannot have.
 
     With a number of captures: of every engine and task so many, in an order of objects and materials that is drawn once
     and for all, first one of each task and engine, then another.
@@ -192,14 +194,14 @@ def drawn(names: dict[str, Sequence[str]], captures: int | None) -> list[tuple[s
     if captures is not None:
         pairs = [pairs[k] for k in np.random.default_rng(0).permutation(len(pairs))]
     able = {
-        engine: [pair for pair in pairs if refusal(engine, load_item(pair[0]).solid) is None][:captures]
+        engine: [pair for pair in pairs if refusal(engine, load_item(pair[0]).solid) is None]
         for engine in names["engines"]
     }
     cells = [
         (index, (task, *pair, engine))
         for engine in names["engines"]
         for task in names["tasks"]
-        for index, pair in enumerate(able[engine])
+        for index, pair in enumerate([one for one in able[engine] if (task, one[0]) not in UNABLE][:captures])
     ]
     return [cell for _, cell in (sorted(cells, key=lambda one: one[0]) if captures is not None else cells)]
 
