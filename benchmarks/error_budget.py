@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
@@ -39,9 +39,14 @@ class Line:
 
     name: str
     captures: dict[str, tuple[float, float]]
-    friction: list[float]
+    friction: dict[str, float]
     paired: bool = True
     """Whether its captures are those of the reference."""
+
+    def at(self, captures: set[str]) -> Line:
+        """Return the line on some captures."""
+        kept = {name: value for name, value in self.captures.items() if name in captures}
+        return replace(self, captures=kept, friction={k: v for k, v in self.friction.items() if k in captures})
 
     def middle(self, place: int) -> float:
         """Return the median over captures [mm] for 0, [deg] for 1."""
@@ -49,21 +54,27 @@ class Line:
 
 
 def budget(results: Sequence[dict[str, Any]], task: str) -> list[Line]:
-    """Return the lines of a task, the reference first and the floor last; those without results are left out."""
+    """Return the lines of a task, the reference first and the floor last, on the captures that all of them have.
+
+    Lines without results are left out; those against our own engine have captures of their own.
+    """
     rows = [row for row in results if row["task"] == task and "episodes" in row]
     judged = [row for row in rows if row["engine"] in JUDGES]
     reference = [row for row in judged if row["row"] == REFERENCE]
     lines = [_line(REFERENCE, reference)]
-    lines.append(Line(FRICTION, {_capture(r): _medians(r["true_friction"]) for r in reference}, []))
+    lines.append(Line(FRICTION, {_capture(r): _medians(r["true_friction"]) for r in reference}, {}))
     lines += [_line(part, [r for r in judged if r["row"] == f"{REFERENCE}, {part}"]) for part in PARTS]
     own = [row for row in rows if row["engine"] not in JUDGES and row["row"] == REFERENCE]
     lines.append(_line(LAW, own, paired=False))
     lines.append(_line("all true but the law (floor)", [row for row in judged if row["row"] == FLOOR]))
-    return [line for line in lines if line.captures]
+    lines = [line for line in lines if line.captures]
+    common = set.intersection(*(set(line.captures) for line in lines if line.paired)) if lines else set()
+    return [line.at(common) if line.paired else line for line in lines] if common else []
 
 
 def _line(name: str, rows: Sequence[dict[str, Any]], paired: bool = True) -> Line:
-    friction = [abs(row["parameter_errors"]["friction"]) for row in rows if row["parameter_errors"].get("friction")]
+    errors = {_capture(row): row["parameter_errors"].get("friction") for row in rows}
+    friction = {capture: abs(error) for capture, error in errors.items() if error}
     return Line(name, {_capture(row): _medians(row["episodes"]) for row in rows}, friction, paired)
 
 
@@ -97,7 +108,7 @@ def table(results: Sequence[dict[str, Any]]) -> str:
     for task in TASKS:
         found = budget(results, task)
         for line in found:
-            friction = f"{100 * np.median(line.friction):.0f}" if line.friction else "–"
+            friction = f"{100 * np.median(list(line.friction.values())):.0f}" if line.friction else "–"
             cells = [
                 task,
                 line.name,

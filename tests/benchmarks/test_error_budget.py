@@ -66,15 +66,17 @@ def result(row: str, engine: str, obj: str, mm: float, deg: float) -> dict:
 @pytest.mark.evidence
 def test_the_budget_pairs_captures_and_keeps_our_own_engine_apart() -> None:
     budget = module("error_budget")
-    rows = [
+    rows = [  # of the l_block cgwm alone has a result
         result("cgwm", "rapier", "box", 10, 4), result("cgwm", "rapier", "mug", 20, 6),
-        result("cgwm, true shape", "rapier", "mug", 12, 3), result("floor", "rapier", "box", 5, 2),
+        result("cgwm, true shape", "rapier", "mug", 12, 3), result("cgwm, true shape", "rapier", "box", 6, 2),
+        result("floor", "rapier", "box", 5, 2), result("floor", "rapier", "mug", 5, 2),
+        result("cgwm", "rapier", "l_block", 50, 6),
         result("cgwm", "cgwm", "box", 3, 1),
     ]  # fmt: skip
     table = budget.table(rows)
     assert "| fall | cgwm | 2 | 15.0 | 5.0 | 20 | – | – |" in table
     assert "| fall | true friction | 2 | 7.5 | 5.0 | – | 7.5 (5.0 to 10.0) |" in table
-    assert "| fall | true shape | 1 | 12.0 | 3.0 | 20 | 8.0 (8.0 to 8.0) | 3.0 (3.0 to 3.0) |" in table
+    assert "| fall | true shape | 2 | 9.0 | 2.5 | 20 | 6.0 (4.0 to 8.0) | 2.5 (2.0 to 3.0) |" in table
     assert "our engine as the truth) | 1 | 3.0 | 1.0 | 20 | – | – |" in table
     drawn = ET.fromstring(budget.chart(rows))
     assert sum(element.tag.endswith("rect") for element in drawn) == 1 + 2 * 5
