@@ -158,10 +158,13 @@ def smooth(errors: Errors, values: Array, rate_hz: float) -> Array:
 
 def _root(times_s: Array, scale_s: float, kind: str) -> Array:
     """Return a root (T, T) of the correlation of slow errors."""
+    return np.asarray(np.linalg.cholesky(slow_correlation(times_s, scale_s, kind) + 1e-9 * np.eye(len(times_s))))
+
+
+def slow_correlation(times_s: Array, scale_s: float, kind: str) -> Array:
+    """Return the correlation (T, T) of slow errors at times [s]."""
     apart = np.abs(times_s[:, None] - times_s) / scale_s
     if kind == "matern":
         apart = np.sqrt(3.0) * apart
-        correlation = (1 + apart) * np.exp(-apart)
-    else:
-        correlation = np.exp(-apart)
-    return np.asarray(np.linalg.cholesky(correlation + 1e-9 * np.eye(len(times_s))), np.float64)
+        return (1 + apart) * np.exp(-apart)
+    return np.exp(-apart)

@@ -18,13 +18,14 @@ from ..physics.effects.effect import ActiveEffect
 from ..physics.parameters import Parameter
 from ..physics.world import World
 from ..segments.candidates import Candidate, Variant, acts_in, admissible, base_parameters, variants_of
-from ..segments.linearization import Linearization, linearize
+from ..segments.linearization import Linearization
 from ..segments.segment_fit import Refit, refit
 from ..segments.segments import Segments
 from ..trajectories.innovations import WHITE
 from .evidence import Evidence
 from .falsification import Repetition, repetition
 from .score_test import ScoreTest, canonical_correlation, gain_by_episode, score_test
+from .session_scales import linearize_beside_scales
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.flight
@@ -104,7 +105,7 @@ def select_next(
     """
     kept, _ = admissible(world, candidates, turned, flight.observations.spin_rad_s is not None)
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if acts_in(v, "flight")]
-    linear = linearize(flight, world, variants, groups, robust=False)
+    linear = linearize_beside_scales(flight, world, variants, groups)
     evidence = tested(linear, kept, variants, dispersion)
     level = LIMITS.alpha / max(1, len(evidence))
     significant = [e for e in evidence if e.p_value < level]
@@ -119,7 +120,10 @@ def select_next(
     equals = _equals(done, linear, kept, variants, dispersion)
     if flight.noise_model != WHITE:
         equals = _with_unproven(equals, done, linear.episode)
-    named = not any(is_slight(e) for e in equals) and (flight.noise_model == WHITE or repeats(equals[0], len(evidence)))
+    equals = _simplest_within(equals, done, linear, kept, variants)
+    named = not any(is_slight(e) for e in equals) and (
+        flight.noise_model == WHITE or any(repeats(e, len(evidence)) for e in equals)  # the level is that of all tests
+    )
     return SelectionStep(tuple(ranking), tuple(equals), named)
 
 
@@ -288,10 +292,39 @@ def _with_unproven(equals: Sequence[Evidence], done: Sequence[Evidence], episode
     return sorted(found, key=_complexity)
 
 
+def _simplest_within(
+    equals: Sequence[Evidence],
+    done: Sequence[Evidence],
+    linear: Linearization,
+    candidates: Sequence[Candidate],
+    variants: Sequence[Variant],
+) -> list[Evidence]:
+    """Return the equals with the best simpler effect, and its equals, that the best one contains as a special case.
+
+    A constant force is a tilt and another gravity together, which no flight tells apart, and each of which comes alone:
+    what the simpler one leaves is for the next step to name.
+    """
+    best, names = equals[0], {one.name for one in equals}
+    size = len(best.candidate.effect.parameters)
+    within = [
+        other
+        for other in done
+        if len(other.candidate.effect.parameters) < size
+        and "drag" not in best.candidate.effect.needs
+        and _contains(linear, candidates, variants, other, best)
+    ]
+    near = [one for one in within if _bic(one) - _bic(within[0]) < LIMITS.alias_chi2 and one.name not in names]
+    return sorted([*equals, *near], key=_complexity) if near else list(equals)
+
+
+def _bic(one: Evidence) -> float:
+    """Return the change of BIC; infinite where it is unknown."""
+    return math.inf if one.delta_bic is None else one.delta_bic
+
+
 def _complexity(one: Evidence) -> tuple[bool, int, float, str]:
     """Return what equals are ordered by: whether they act through another effect, their parameters, and BIC."""
-    bic = math.inf if one.delta_bic is None else one.delta_bic
-    return "drag" in one.candidate.effect.needs, len(one.candidate.effect.parameters), bic, one.name
+    return "drag" in one.candidate.effect.needs, len(one.candidate.effect.parameters), _bic(one), one.name
 
 
 def _contains(

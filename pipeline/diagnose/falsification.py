@@ -25,6 +25,7 @@ from ..segments.candidates import base_values
 from ..segments.linearization import Linearization, layout, linearize, sums, widths
 from ..segments.segments import Segments
 from .score_test import score_test, solved
+from .session_scales import NAME, linearize_beside_scales
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -68,13 +69,24 @@ def consistency(
     """
     if not names:
         return None
-    linear = linearize(flight, world, (), groups, robust=False)
+    linear = linearize_beside_scales(flight, world, (), groups)
     columns = [k for k, p in enumerate(linear.parameters) if p.name.partition(".")[0] in names]
     if not columns:
         return None
+    linear = _beside(linear, [k for k, p in enumerate(linear.parameters) if p.name.partition(".")[0] == NAME], columns)
     values = base_values(world, [linear.parameters[k] for k in columns]).numpy()
     units = (linear.episode, np.arange(len(linear.episode)))
     return max((_over(linear, columns, values, unit, dispersion) for unit in units), key=lambda one: -one.p_value)
+
+
+def _beside(linear: Linearization, nuisance: Sequence[int], columns: Sequence[int]) -> Linearization:
+    """Return a linearization whose scores are those beside nuisance parameters, fitted jointly with some columns."""
+    if not nuisance:
+        return linear
+    joint = [*nuisance, *columns]
+    information, score = sums(linear, joint)
+    fitted = solved(information, score, widths(linear, joint))[0][: len(nuisance)]
+    return replace(linear, score=linear.score - linear.information[:, :, list(nuisance)] @ fitted)
 
 
 def _over(

@@ -99,7 +99,7 @@ class FlightFindings:
     def predicts(self) -> bool:
         """Whether each selected effect repeats from episode to episode; False without any."""
         chosen = [step for step in self.steps if step.flagged]
-        return bool(chosen) and all(repeats(one.best, len(one.evidence)) for one in chosen)
+        return bool(chosen) and all(any(repeats(e, len(one.evidence)) for e in one.equals) for one in chosen)
 
     @property
     def differs(self) -> bool:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.rotation import continuous_turns
+from .bursts import bursts
 from .observations import Observations
 from .segmentation import Segment
 from .thresholds import TRACK_THRESHOLDS
@@ -73,8 +74,8 @@ def without_outliers(whole: Observations, flight: Sequence[Segment], noise: Nois
     """Remove wrong measurements in flight, and find flight frames in which something touched the body.
 
     A single frame off the cubic through its neighbours is a wrong measurement, and marked as not seen; so are several
-    in a row where the frames before and after them lie on one cubic. Where they do not, something touched the body: a
-    bounce on a ground at another height than stated, or a hand.
+    in a row where the frames before and after them lie on one cubic, or the whole flight on one smooth path. Where they
+    do not, something touched the body: a bounce on a ground at another height than stated, or a hand.
 
     Returns:
         The episodes; the number of wrong measurements; frames (E, T) of flight in which something touched the body.
@@ -86,6 +87,11 @@ def without_outliers(whole: Observations, flight: Sequence[Segment], noise: Nois
         mask = (seen, turned)[kind]
         for episode, frames, column in _bursts(whole, flight, noise, kind):
             mask[episode, frames, column] = 0.0
+            wrong |= {(kind, episode, int(frame), column) for frame in frames}
+    whole = replace(whole, seen=seen.clone(), has_orientation=turned.clone())
+    for kind in (0, 1):
+        for episode, frames, column in bursts(whole, flight, kind):
+            (seen, turned)[kind][episode, frames, column] = 0.0
             wrong |= {(kind, episode, int(frame), column) for frame in frames}
     count, whole = len(wrong), replace(whole, seen=seen.clone(), has_orientation=turned.clone())
     wrong.clear()

@@ -75,6 +75,27 @@ class TrackNoiseThresholds:
     least_burst: int = threshold(
         2, "frames", "fewest wrong frames in such a row; a single one is told by itself", BY_ARGUMENT
     )
+    burst_share: float = threshold(
+        6.0,
+        "1",
+        "mean square of such a row, in usual ones, beside the smooth path of the whole flight",
+        "by argument: as `unsound` of flights, and the odds of the rows that are looked at beside it",
+    )
+    burst_rest: float = threshold(
+        2.0,
+        "1",
+        "largest mean square of the rest of its flight, in usual ones: what touched the body leaves more",
+        "by argument: ten independent errors exceed it once in thirty flights",
+    )
+    burst_sides: tuple[float, float] = threshold(
+        (3, 0.04),
+        "frames, s",
+        "fewest frames of a flight, and their least time, before and after such a row: a filter smears contacts as far",
+        "by argument: as `smeared_s`",
+    )
+    burst_most: tuple[float, float] = threshold(
+        (2, 0.34), "1", "most such rows of a flight, and most of its frames that they take together", BY_ARGUMENT
+    )
     keep_sigmas: float = threshold(
         4.0,
         "sigmas",

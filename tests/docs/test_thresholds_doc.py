@@ -45,6 +45,7 @@ STATED = [
 TABLE = {f"{group}.{one.name}": one for group, some in thresholds_page.groups().items() for one in some}
 """Thresholds of a diagnosis, by group.field."""
 NUMERICS = {
+    "session_scales.LEAST_SPREAD": "keeps a matrix solvable",
     "contact_information.LEAST_STEP_S": "resolution of simulated motions",
     "contact_information.WEAK_SHARE": "keeps a matrix solvable",
     "coupled_effects.ITERATIONS": "bounds the duration of a refit",
@@ -198,6 +199,9 @@ TRACK_NUMERICS = {
         "residuals.STATE_STEPS",
     ),
     "window of an estimate, and the polynomial in it": (
+        "bursts.DEGREES",
+        "bursts.KEPT, ROUNDING",
+        "bursts.LEAST_FREE",
         "correlated_noise.LONGEST_S",
         "correlated_noise.LEAST_DEGREE, MOST_DEGREE",
         "correlated_noise.CIRCLE_LEFT",

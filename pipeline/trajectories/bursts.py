@@ -1,0 +1,187 @@
+"""Bursts: rows of wrong measurements within a flight, whose frames before and after them lie on one smooth path.
+
+What nothing pushes follows a low polynomial, its marker with what the measured turn adds, and both sides of a wrong row
+lie on the same one; after a contact they do not. Leaving out frames R lowers the sum of squares of a linear fit with
+residuals e and projector H by e_R' (1 - H_RR)^-1 e_R, whatever was measured there. A row is wrong where this is more
+than `LIMITS.burst_share` times what its frames have elsewhere, what is left of the flight is as quiet as others, and no
+change of the velocity within the row explains it better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..geometry.rotation import continuous_turns, quat_to_matrix
+from .observations import Observations
+from .segmentation import Segment
+from .thresholds import TRACK_THRESHOLDS
+from .track_noise import FLOOR_M, FLOOR_RAD, MAD_TO_STD, moves
+
+LIMITS = TRACK_THRESHOLDS.track_noise
+Array = NDArray[np.float64]
+
+DEGREES = (3, 4)
+"""Degree of the polynomial of a marker whose turn is measured, and of all else: drag and lift bend a fall."""
+KEPT, ROUNDING = 1e-3, 1e-6
+"""Smallest share of the largest singular value of the functions of a path that counts, and what keeps a factor real."""
+LEAST_FREE = 8
+"""Fewest frames of a flight beside a burst and the coefficients of its path."""
+
+
+@dataclass(frozen=True)
+class _Path:
+    """One kind of measurement of one flight, and the smooth paths that it may follow."""
+
+    episode: int
+    """Index of the episode."""
+    column: int
+    """The body."""
+    frames: NDArray[np.int64]
+    """Measured frames (n)."""
+    time_s: Array
+    """Their times (n) [s]."""
+    values: Array
+    """Coordinates (n, c) [m or rad]."""
+    basis: Array
+    """Functions of time that each coordinate may follow, (c, n, q)."""
+
+    def without(self, wrong: NDArray[np.bool_]) -> _Path:
+        """Leave out frames."""
+        kept = ~wrong
+        return replace(
+            self,
+            frames=self.frames[kept],
+            time_s=self.time_s[kept],
+            values=self.values[kept],
+            basis=self.basis[:, kept],
+        )
+
+    def fitted(self) -> tuple[Array, Array]:
+        """Return residuals (n, c), and the projectors (c, n, n) on the paths."""
+        length = np.linalg.norm(self.basis, axis=1, keepdims=True)
+        u, s, _ = np.linalg.svd(self.basis / np.where(length > 0, length, 1.0), full_matrices=False)
+        u = u * (s > KEPT * s.max(1, keepdims=True))[:, None]
+        projector = u @ u.swapaxes(1, 2)
+        return self.values - np.einsum("cij,jc->ic", projector, self.values), projector
+
+    def square(self) -> float:
+        """Return the sum of squares of the residuals."""
+        return float(np.square(self.fitted()[0]).sum())
+
+    def bent_at(self, at_s: float) -> _Path:
+        """Return the measurements with paths that may change their velocity at a time [s]."""
+        late = np.maximum(self.time_s - at_s, 0.0)
+        return replace(
+            self, basis=np.concatenate((self.basis, np.broadcast_to(late[:, None], (len(self.basis), len(late), 1))), 2)
+        )
+
+    @property
+    def free(self) -> int:
+        """Number of frames beside the coefficients."""
+        return len(self.frames) - self.basis.shape[2]
+
+
+def bursts(whole: Observations, flight: Sequence[Segment], kind: int) -> Iterator[tuple[int, NDArray[np.int64], int]]:
+    """Yield episode, frames and body of the bursts in flights.
+
+    Args:
+        whole: The episodes.
+        flight: Their flights.
+        kind: 0 for positions, 1 for rotations.
+    """
+    paths = [path for item in flight for k in range(len(whole.free)) if (path := _path(whole, item, k, kind))]
+    sigma = max(_usual(paths), (FLOOR_M, FLOOR_RAD)[kind])
+    for path in paths:
+        found = _found(path, sigma)
+        if len(found):
+            yield path.episode, found, path.column
+
+
+def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path | None:
+    """Return a flight's measurements of one kind; None of too few."""
+    frames = torch.arange(item.first, item.last + 1)
+    masks = (whole.seen, whole.has_orientation)
+    frames = frames[masks[kind][item.episode, frames, column] > 0]
+    turned = bool((masks[1][item.episode, frames, column] > 0).all())
+    times = whole.times_s[item.episode, frames]
+    if len(frames) < LEAST_FREE + 2 * LIMITS.burst_sides[0]:
+        return None
+    quat = whole.quat_wxyz[item.episode, frames, column]
+    t = times.numpy()
+    scaled = (t - t.mean()) / (t[-1] - t[0])
+    powers = np.vander(scaled, DEGREES[0 if kind == 0 and turned else 1] + 1)
+    axes = np.ones(3, bool)
+    if kind == 0:
+        axes = moves(whole.position_m[item.episode, whole.seen[item.episode, :, column] > 0, column].numpy())
+        values = whole.position_m[item.episode, frames, column].numpy()[:, axes]
+    else:
+        values = continuous_turns(times, quat, reference=torch.tensor(len(frames) // 2)).numpy()
+    basis = np.broadcast_to(powers, (int(axes.sum()), *powers.shape))
+    if kind == 0 and turned:
+        # a marker beside the centre of mass turns with the body
+        turn = quat_to_matrix(quat).numpy()[:, axes].swapaxes(0, 1)
+        basis = np.concatenate((basis, turn), 2)
+    path = _Path(item.episode, column, frames.numpy(), t, values.astype(np.float64), basis)
+    return path if path.free >= LEAST_FREE else None
+
+
+def _usual(paths: Sequence[_Path]) -> float:
+    """Return the robust standard deviation of what paths leave; 0 without any."""
+    left = []
+    for path in paths:
+        away, projector = path.fitted()
+        left.append((away / np.sqrt((1 - projector.diagonal(axis1=1, axis2=2)).clip(1e-3)).T).ravel())
+    return MAD_TO_STD * float(np.median(np.abs(np.concatenate(left)))) if left else 0.0
+
+
+def _found(path: _Path, sigma: float) -> NDArray[np.int64]:
+    """Return the frames of the bursts of a flight; none where the rest of it is not as quiet as usual, or bends."""
+    every, wrong, middle_s = path, [], []
+    for _ in range(int(LIMITS.burst_most[0])):
+        row = _worst(path, sigma)
+        if row is None:
+            break
+        wrong.append(path.frames[row])
+        middle_s.append(float(path.time_s[row].mean()))
+        path = path.without(row)
+    none = every.frames[:0]
+    if not wrong or path.free < LEAST_FREE or len(path.frames) < (1 - LIMITS.burst_most[1]) * len(every.frames):
+        return none
+    left, axes = path.square() / sigma**2, path.values.shape[1]
+    bends = max(left - path.bent_at(at).square() / sigma**2 for at in middle_s)
+    touched = left > LIMITS.burst_rest * path.free * axes or bends > LIMITS.burst_share * axes
+    return none if touched else np.sort(np.concatenate(wrong))
+
+
+def _worst(path: _Path, sigma: float) -> NDArray[np.bool_] | None:
+    """Return the row of frames (n) that most exceeds the usual errors; None where none does."""
+    away, projector = path.fitted()
+    count, axes = away.shape
+    step = float(np.median(np.diff(path.time_s)))
+    side = max(int(LIMITS.burst_sides[0]), round(LIMITS.burst_sides[1] / step))
+    longest = min(1 + int(LIMITS.longest_burst_s / step), path.free - LEAST_FREE, count - 2 * side)
+    starts = np.arange(side, count - side)
+    if longest < 1 or not len(starts):
+        return None
+    rows = starts[:, None] + np.arange(longest)
+    inside = rows < count - side
+    rows = rows.clip(max=count - 1)
+    pairs = rows[:, :, None], rows[:, None, :]
+    block = (np.eye(count) - projector)[:, *pairs] * (inside[:, :, None] & inside[:, None, :])
+    block += np.eye(longest) * np.where(inside, ROUNDING, 1.0)[:, None, :]
+    # a factor's leading part is the factor of the leading part: one gives all lengths of a row
+    own = np.linalg.solve(np.linalg.cholesky(block), (away[rows] * inside[..., None]).transpose(2, 0, 1)[..., None])
+    falls = np.square(own[..., 0]).sum(0).cumsum(1) / sigma**2
+    size = np.arange(1, longest + 1) * axes
+    excess = np.where(inside, falls - LIMITS.burst_share * size, -np.inf)
+    place = np.unravel_index(int(excess.argmax()), excess.shape)
+    if excess[place] <= 2 * np.log(excess.size):
+        return None
+    row = np.zeros(count, bool)
+    row[rows[place[0], : place[1] + 1]] = True
+    return row

@@ -1,0 +1,53 @@
+"""Scales of lengths that differ between sessions: they are no scatter of effects, and no vertical force."""
+
+import pytest
+from cgwm.pipeline.diagnose.effect_selection import select_next
+from cgwm.pipeline.diagnose.falsification import repetition
+from cgwm.pipeline.diagnose.score_test import score_test
+from cgwm.pipeline.diagnose.session_scales import NAME, linearize_beside_scales
+from cgwm.pipeline.physics.effects import load_effect
+from cgwm.pipeline.segments.candidates import Candidate, variants_of
+from cgwm.pipeline.segments.linearization import Linearization, linearize
+from cgwm.pipeline.segments.prepare import Prepared, prepare
+from helpers.diagnosis_data import tosses, world_with
+
+GROUPS = (0, 1, 0, 1, 0, 1)
+CANDIDATES = [Candidate(name, load_effect(name)) for name in ("gravity_scale", "gravity_tilt", "constant_force")]
+
+
+def recorded(scales: tuple[float, float], effects: dict | None = None) -> tuple[Prepared, object]:
+    world, episodes = world_with("cube", None, False), tosses(world_with("cube", effects, False), 5, duration_s=0.4)
+    for group, (_, tracks) in zip(GROUPS, episodes, strict=True):
+        for track in tracks.values():
+            track.position_m[:] *= 1 + scales[group]
+    return prepare(world, episodes, groups=GROUPS), world
+
+
+def both(prepared: Prepared, world: object) -> tuple[Linearization, Linearization, list[list[str]]]:
+    assert prepared.flight is not None
+    variants = variants_of(CANDIDATES, world.gravity[0, :1])  # pyright: ignore[reportAttributeAccessIssue]
+    plain = linearize(prepared.flight, world, variants, GROUPS, robust=False)  # pyright: ignore[reportArgumentType]
+    beside = linearize_beside_scales(prepared.flight, world, variants, GROUPS)  # pyright: ignore[reportArgumentType]
+    return plain, beside, [v.parameters for v in variants]
+
+
+def test_scales_that_differ_between_sessions_are_no_scatter_of_an_effect() -> None:
+    plain, beside, columns = both(*recorded((0.01, -0.01)))
+    gravity = columns[0]
+    assert repetition(plain, plain.columns(gravity), 1.0).scatter > 10
+    assert repetition(beside, beside.columns(gravity), 1.0).scatter < 2.5
+    assert [p.name for p in beside.parameters[: beside.base]] == [f"{NAME}.s0"]
+
+
+def test_sessions_of_one_scale_take_nothing_from_an_effect() -> None:
+    plain, beside, columns = both(*recorded((0.0, 0.0), {"gravity_scale": {"s": 0.01}}))
+    for names in columns:
+        tests = [score_test(one, one.columns(names)).statistic for one in (plain, beside)]
+        assert tests[1] == pytest.approx(tests[0], rel=0.1)
+
+
+def test_a_tilt_and_a_scale_are_no_constant_force_alone() -> None:
+    prepared, world = recorded((0.012, 0.004), {"gravity_tilt": {"tilt_x": 0.02, "tilt_y": 0.01}})
+    assert prepared.flight is not None
+    step = select_next(prepared.flight, world, CANDIDATES, GROUPS, True)  # pyright: ignore[reportArgumentType]
+    assert [one.name for one in step.equals] == ["gravity_tilt", "constant_force"]

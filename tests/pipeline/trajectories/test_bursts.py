@@ -1,0 +1,63 @@
+"""Bursts of wrong measurements in flights: rows that the frames around them contradict, and nothing else."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from cgwm.datasets.capture.tracks import Episode, Track
+from cgwm.pipeline.trajectories.bursts import bursts
+from cgwm.pipeline.trajectories.flight_noise import without_outliers
+from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
+from cgwm.pipeline.trajectories.track_noise import Noise
+from helpers.diagnosis_data import NOISE, tosses, world_with
+
+
+def flights(effects: dict | None = None, seed: int = 3) -> tuple[object, Sequence[Episode]]:
+    truth = world_with("cube", effects, False)
+    return world_with("cube", None, False), tosses(truth, seed, count=4, duration_s=0.4)
+
+
+def track_of(episode: Episode) -> Track:
+    return next(iter(episode[1].values()))
+
+
+def found(world: object, episodes: Sequence[Episode]) -> dict[tuple[int, int], list[int]]:
+    """Return the frames of bursts by kind and episode."""
+    whole = whole_episodes(world, episodes)  # pyright: ignore[reportArgumentType]
+    flight, _, _ = cut_episodes(world, whole, NOISE)  # pyright: ignore[reportArgumentType]
+    return {(kind, episode): frames.tolist() for kind in (0, 1) for episode, frames, _ in bursts(whole, flight, kind)}
+
+
+@pytest.mark.parametrize("first", [8, 27])
+def test_a_row_of_wrong_positions_is_found_and_no_other_frame(first: int) -> None:
+    world, episodes = flights()
+    rng = np.random.default_rng(first)
+    track_of(episodes[1]).position_m[first : first + 5] += 12 * NOISE[0] * rng.standard_normal((5, 3))
+    rows = found(world, episodes)
+    assert set(rows) == {(0, 1)}
+    assert set(rows[0, 1]) <= set(range(first, first + 5)) and len(rows[0, 1]) >= 4
+
+
+def test_a_lasting_force_and_a_marker_beside_the_centre_are_no_bursts() -> None:
+    assert not found(*flights())
+    assert not found(*flights({"marker_offset": {"d_x": 0.01, "d_y": -0.01, "d_z": 0.005}}))
+    assert not found(*flights({"quadratic_drag": {"k": 0.5}, "gravity_tilt": {"tilt_x": 0.05, "tilt_y": 0.0}}))
+
+
+def test_a_push_within_a_flight_is_no_burst() -> None:
+    world, episodes = flights()
+    track = track_of(episodes[2])
+    track.position_m[20:, 0] += 0.8 * (track.time_s[20:] - track.time_s[20])
+    assert (0, 2) not in found(world, episodes)
+
+
+def test_a_burst_near_others_does_not_count_as_a_touch() -> None:
+    world, episodes = flights()
+    rng = np.random.default_rng(0)
+    for episode in episodes:
+        track_of(episode).position_m[15:20] += 15 * NOISE[0] * rng.standard_normal((5, 3))
+    whole = whole_episodes(world, episodes)  # pyright: ignore[reportArgumentType]
+    flight, _, _ = cut_episodes(world, whole, NOISE)  # pyright: ignore[reportArgumentType]
+    seen, count, touched = without_outliers(whole, flight, Noise(*NOISE))
+    assert 16 <= count <= 20 and not bool(touched.any())
+    assert not bool(seen.seen[:, 16:19].any(1).all())
