@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from ..geometry.rotation import continuous_turns, quat_to_matrix
 from .observations import Observations
@@ -29,6 +30,8 @@ DEGREES = (3, 4)
 """Degree of the polynomial of a marker whose turn is measured, and of all else: drag and lift bend a fall."""
 KEPT, ROUNDING = 1e-3, 1e-6
 """Smallest share of the largest singular value of the functions of a path that counts, and what keeps a factor real."""
+LEAST_TURNED = 0.5
+"""Share of the frames whose turn is measured from which that of the others is interpolated."""
 LEAST_FREE = 8
 """Fewest frames of a flight beside a burst and the coefficients of its path."""
 
@@ -107,7 +110,8 @@ def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path |
     frames = torch.arange(item.first, item.last + 1)
     masks = (whole.seen, whole.has_orientation)
     frames = frames[masks[kind][item.episode, frames, column] > 0]
-    turned = bool((masks[1][item.episode, frames, column] > 0).all())
+    known = masks[1][item.episode, frames, column].numpy() > 0
+    turned = bool(known.mean() > LEAST_TURNED) if len(known) else False
     times = whole.times_s[item.episode, frames]
     if len(frames) < LEAST_FREE + 2 * LIMITS.burst_sides[0]:
         return None
@@ -124,7 +128,7 @@ def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path |
     basis = np.broadcast_to(powers, (int(axes.sum()), *powers.shape))
     if kind == 0 and turned:
         # a marker beside the centre of mass turns with the body
-        turn = quat_to_matrix(quat).numpy()[:, axes].swapaxes(0, 1)
+        turn = CubicSpline(t[known], quat_to_matrix(quat).numpy()[known])(t)[:, axes].swapaxes(0, 1)
         basis = np.concatenate((basis, turn), 2)
     path = _Path(item.episode, column, frames.numpy(), t, values.astype(np.float64), basis)
     return path if path.free >= LEAST_FREE else None

@@ -88,8 +88,8 @@ def without_outliers(whole: Observations, flight: Sequence[Segment], noise: Nois
         for episode, frames, column in _bursts(whole, flight, noise, kind):
             mask[episode, frames, column] = 0.0
             wrong |= {(kind, episode, int(frame), column) for frame in frames}
-    whole = replace(whole, seen=seen.clone(), has_orientation=turned.clone())
-    for kind in (0, 1):
+    for kind in (1, 0):  # a wrong turn would move a marker beside the centre of mass
+        whole = replace(whole, seen=seen.clone(), has_orientation=turned.clone())
         for episode, frames, column in bursts(whole, flight, kind):
             (seen, turned)[kind][episode, frames, column] = 0.0
             wrong |= {(kind, episode, int(frame), column) for frame in frames}

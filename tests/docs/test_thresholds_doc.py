@@ -202,6 +202,7 @@ TRACK_NUMERICS = {
         "bursts.DEGREES",
         "bursts.KEPT, ROUNDING",
         "bursts.LEAST_FREE",
+        "bursts.LEAST_TURNED",
         "correlated_noise.LONGEST_S",
         "correlated_noise.LEAST_DEGREE, MOST_DEGREE",
         "correlated_noise.CIRCLE_LEFT",

@@ -1,27 +1,27 @@
 """Bursts of wrong measurements in flights: rows that the frames around them contradict, and nothing else."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
-from cgwm.datasets.capture.tracks import Episode, Track
+from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.trajectories.bursts import bursts
 from cgwm.pipeline.trajectories.flight_noise import without_outliers
 from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.diagnosis_data import NOISE, tosses, world_with
 
+Episodes = list[tuple[str, dict[str, Track]]]
 
-def flights(effects: dict | None = None, seed: int = 3) -> tuple[object, Sequence[Episode]]:
+
+def flights(effects: dict | None = None, seed: int = 3) -> tuple[object, Episodes]:
     truth = world_with("cube", effects, False)
     return world_with("cube", None, False), tosses(truth, seed, count=4, duration_s=0.4)
 
 
-def track_of(episode: Episode) -> Track:
+def track_of(episode: tuple[str, dict[str, Track]]) -> Track:
     return next(iter(episode[1].values()))
 
 
-def found(world: object, episodes: Sequence[Episode]) -> dict[tuple[int, int], list[int]]:
+def found(world: object, episodes: Episodes) -> dict[tuple[int, int], list[int]]:
     """Return the frames of bursts by kind and episode."""
     whole = whole_episodes(world, episodes)  # pyright: ignore[reportArgumentType]
     flight, _, _ = cut_episodes(world, whole, NOISE)  # pyright: ignore[reportArgumentType]
