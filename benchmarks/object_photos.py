@@ -44,6 +44,8 @@ class Session:
     """Share of mirrored light [1]."""
     seed: int
     """Of the places, the clutter and the noise."""
+    lamp_deg: float = 0.0
+    """Angle by which the lamp is turned about the vertical."""
 
 
 def poses(session: Session, mesh: Mesh) -> list[Array]:
@@ -100,7 +102,8 @@ def _shaded(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the linear image under a lamp that stands beside the camera's first place, and the object's mask."""
     colors, normals, cover, _ = draw_parts(painted, camera, _BACKDROP[session.background], samples=2)
-    lamp = np.array([0.4, -0.5, 0.75])
+    turn = np.radians(session.lamp_deg)
+    lamp = np.array([0.4 * np.cos(turn) + 0.5 * np.sin(turn), 0.4 * np.sin(turn) - 0.5 * np.cos(turn), 0.75])
     view = place[:3, 3] - painted.mesh.vertices.mean(0)
     half = lamp / np.linalg.norm(lamp) + view / np.linalg.norm(view)
     diffuse = 0.45 + 0.55 * np.clip(normals @ lamp / np.linalg.norm(lamp), 0, 1)

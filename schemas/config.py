@@ -54,6 +54,8 @@ class SplatConfig(FileModel):
     """Learn a gain of each colour channel for every photo: for photos whose exposure or white balance varies."""
     refine_poses: bool = False
     """Refine the poses of the photos' cameras first; the model then holds them in `cameras.json`."""
+    gloss: bool = False
+    """Let colours of bodies depend on the direction of view where held-out photos are repeated better so."""
     bare_ground: bool = True
     """Lift the shadow that moving bodies cast on the ground in the photos, and fill in the ground that they hid."""
     turntable: bool = True

@@ -40,7 +40,7 @@ def write_splat_files(path: Path, model: Model, sh_degree: int = 0, overwrite: b
 
 
 def in_world(model: Model, poses: dict[str, tuple[np.ndarray, np.ndarray]] | None = None) -> Splats:
-    """Return all visual spheres in the world frame.
+    """Return all visual spheres in the world frame; bodies with their mean colours over all directions.
 
     Args:
         model: A model with visual spheres.
@@ -52,7 +52,8 @@ def in_world(model: Model, poses: dict[str, tuple[np.ndarray, np.ndarray]] | Non
         position, quat = (poses or {}).get(name, (np.array(photo.position_m), np.array(photo.quat_wxyz)))
         rotation = Rotation.from_quat(quat, scalar_first=True).as_matrix()
         normals = None if splats.normals is None else splats.normals @ rotation.T
-        parts.append(replace(splats, means=splats.means @ rotation.T + position, normals=normals))
+        means = splats.means @ rotation.T + position
+        parts.append(replace(splats, means=means, normals=normals, harmonics=None))
     return _joined(parts)
 
 

@@ -87,7 +87,7 @@ def read_model(path: Path | str) -> Model:
     collision: dict[str, Splats] = {}
     for body in file.bodies:
         if body.splats is not None:
-            body_splats[body.name] = collision[body.name] = read_splats(_inside(root, body.splats))
+            body_splats[body.name] = collision[body.name] = read_splats(_inside(root, body.splats), harmonics=True)
         if body.collision is not None:
             collision[body.name] = read_splats(_inside(root, body.collision))
     require_agreement(file, collision, root / "model.json")

@@ -57,7 +57,7 @@ class Splats:
     they are not known.
     """
     harmonics: Array | None = None
-    """Only of what never turns (a scene): coefficients of the spherical harmonics of degree 1 to 3 that add to the
+    """Coefficients of the spherical harmonics of degree 1 to 3 that add to the
     colours, 3DGS's signs, shape (N, K, 3) with K = 3, 8 or 15; None: the same from all sides.
     """
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...datasets.shapes.ply import Splats
-from .spherical_harmonics import seen_colors
+from .spherical_harmonics import rotated, seen_colors
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +25,8 @@ class Spheres:
     colors: Tensor
     """sRGB values in [0, 1], shape (N, 3); with harmonics the mean over all directions."""
     harmonics: Tensor | None = None
-    """Spherical harmonics from degree 1 on, shape (N, K, 3), for spheres that do not rotate; None for equal colours
-    from all sides.
+    """Spherical harmonics from degree 1 on, shape (N, K, 3), in the frame of the centres; None for equal colours from
+    all sides.
     """
 
     def __len__(self) -> int:
@@ -55,15 +55,10 @@ class Spheres:
         return Spheres(self.means, self.scales, self.opacities, colors)
 
     def moved(self, T_to_from: Tensor) -> Spheres:
-        """Return the spheres in another frame, given the rigid transform to it, shape (4, 4).
-
-        Raises:
-            ValueError: If the colours depend on the direction.
-        """
-        if self.harmonics is not None:
-            raise ValueError("colours that depend on the direction cannot be rotated")
+        """Return the spheres in another frame, given the rigid transform to it, shape (4, 4)."""
         means = self.means @ T_to_from[:3, :3].T + T_to_from[:3, 3]
-        return Spheres(means, self.scales, self.opacities, self.colors)
+        higher = None if self.harmonics is None else rotated(self.harmonics, T_to_from[:3, :3])
+        return Spheres(means, self.scales, self.opacities, self.colors, higher)
 
     @staticmethod
     def joined(parts: list[Spheres]) -> Spheres:

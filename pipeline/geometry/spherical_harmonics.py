@@ -47,6 +47,29 @@ def harmonics(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(terms, -1)
 
 
+def rotated(higher: Tensor, rotation: Tensor) -> Tensor:
+    """Return harmonics from degree 1 on whose colours turn with a rotation.
+
+    The new ones have at a direction d the value of the old ones at R^T d. Harmonics of one degree turn among
+    themselves, so that the matrix follows from as many directions as that degree has terms, or more.
+
+    Args:
+        higher: Coefficients, shape (N, (degree + 1)^2 - 1, 3).
+        rotation: R, shape (3, 3).
+    """
+    degree, first, parts = round((higher.shape[1] + 1) ** 0.5) - 1, 0, []
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=-1)
+    there = harmonics(directions, degree)[:, 1:]
+    before = harmonics(directions @ rotation.detach().double().cpu(), degree)[:, 1:]
+    for one in range(1, degree + 1):
+        rows = slice(first, first + 2 * one + 1)
+        matrix = torch.linalg.lstsq(there[:, rows], before[:, rows]).solution
+        parts.append(torch.einsum("kl,nlc->nkc", matrix.to(higher), higher[:, rows]))
+        first = rows.stop
+    return torch.cat(parts, 1)
+
+
 def seen_colors(colors: Tensor, higher: Tensor, means: Tensor, eye: Tensor) -> Tensor:
     """Return the colours (N, 3) of spheres as seen by a camera, at least 0.
 

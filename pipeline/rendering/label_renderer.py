@@ -189,7 +189,8 @@ class LabelRenderer:
                 colors=torch.stack([view.still.colors for view in views]).repeat_interleave(count, 0),
                 labels=views[0].still.labels,
             )
-            moving = [(body, spheres.repeated(len(views))) for body, spheres in placed]
+            eyes = torch.stack([self._scene.tensor(view.camera.center) for view in views])
+            moving = [(body, spheres.seen_from(eyes)) for body, spheres in placed]
             alone = torch.stack([view.alone for view in views]).repeat_interleave(count, 0)
             labels = self._labels(moving, still, viewmats, Ks, Box(0, 0, *size), alone)
             for number, name in enumerate(names):
@@ -223,7 +224,8 @@ class LabelRenderer:
         self, view: _View, plate: _Plate, placed: Sequence[tuple[int, Labelled]], frame: int
     ) -> tuple[Box, _Pictures] | None:
         """Return the box that moving bodies can reach in one frame, and its labels; None where they reach no pixel."""
-        moving = [(body, spheres.view(frame)) for body, spheres in placed]
+        eye = self._scene.tensor(view.camera.center)[None]
+        moving = [(body, spheres.view(frame).seen_from(eye)) for body, spheres in placed]
         bodies = Labelled.joined([self._scene.none, *(spheres for _, spheres in moving)])
         box = reach(bodies, view.viewmat, view.K, view.camera.width, view.camera.height)
         if box is None:

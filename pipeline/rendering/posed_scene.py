@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,32 @@ from ...datasets.models.model import Model
 from ...schemas import BodyModel, Light
 from ..geometry.rotation import quat_to_matrix
 from ..geometry.spheres import Spheres
+from ..geometry.spherical_harmonics import harmonics
 from .relighting import Relighting
+
+
+@dataclass(frozen=True)
+class Gloss:
+    """Colours of a body's spheres that depend on the direction of view."""
+
+    harmonics: Tensor
+    """Coefficients from degree 1 on, body frame, shape (N, K, 3)."""
+    rotations: Tensor
+    """R_world_body of the views, shape (n, 3, 3), or of one, shape (3, 3)."""
+    brightness: Tensor
+    """Factor of the light on each sphere, shape (n, N, 1), or (N, 1); ones without a light."""
+
+    def view(self, number: int) -> Gloss:
+        """Return the gloss of one view."""
+        return Gloss(self.harmonics, self.rotations[number], self.brightness[number])
+
+    def added(self, colors: Tensor, means: Tensor, eye: Tensor) -> Tensor:
+        """Return colours (..., N, 3) as a camera at `eye` (3,) [m] sees them, given the centres (..., N, 3)."""
+        degree = round((self.harmonics.shape[1] + 1) ** 0.5) - 1
+        ways = torch.nn.functional.normalize((means - eye) @ self.rotations, dim=-1)  # in axes of the body
+        basis = harmonics(ways, degree)[..., 1:]
+        more = torch.einsum("...nk,nkc->...nc", basis, self.harmonics)
+        return (colors + self.brightness * more).clamp(0, 1)
 
 
 @dataclass(frozen=True)
@@ -30,6 +55,16 @@ class Labelled:
     """Colours in [0, 1], shape (N, 3), or (n, N, 3) where they differ by view."""
     labels: Tensor
     """Label of each sphere: 0 for the background, k for the k-th body, shape (N,)."""
+    gloss: Gloss | None = None
+    """How the colours of a body depend on the direction of view; None where they do not, or are as a camera sees."""
+
+    def seen_from(self, eyes: Tensor) -> Labelled:
+        """Return the spheres in the colours that cameras at `eyes` (m, 3) [m] see, one set of views after the other."""
+        if self.gloss is None:
+            return self if len(eyes) == 1 else self.repeated(len(eyes))
+        colors = [self.gloss.added(self.colors, self.means, eye) for eye in eyes]
+        whole = replace(self, gloss=None).repeated(len(eyes)) if self.means.dim() == 3 else replace(self, gloss=None)
+        return replace(whole, colors=torch.cat(colors))
 
     def __len__(self) -> int:
         return self.scales.shape[0]
@@ -52,6 +87,7 @@ class Labelled:
             opacities=self.opacities,
             colors=self.colors[number],
             labels=self.labels,
+            gloss=None if self.gloss is None else self.gloss.view(number),
         )
 
     def repeated(self, times: int) -> Labelled:
@@ -61,13 +97,17 @@ class Labelled:
 
     @staticmethod
     def joined(parts: list[Labelled]) -> Labelled:
-        """Concatenate the spheres of several sets, in order; sets with one view are used for all n views."""
+        """Concatenate the spheres of several sets without gloss, in order; sets with one view serve for all n."""
         views = max((part.means.shape[0] for part in parts if part.means.dim() == 3), default=0)
         if views:
             parts = [part._of_views(views) for part in parts]
-        columns = {"means": -2, "scales": 0, "opacities": 0, "colors": -2, "labels": 0}
-        names = [field.name for field in fields(Labelled)]
-        return Labelled(*(torch.cat([getattr(part, name) for part in parts], columns[name]) for name in names))
+        return Labelled(
+            means=torch.cat([part.means for part in parts], -2),
+            scales=torch.cat([part.scales for part in parts]),
+            opacities=torch.cat([part.opacities for part in parts]),
+            colors=torch.cat([part.colors for part in parts], -2),
+            labels=torch.cat([part.labels for part in parts]),
+        )
 
     def _of_views(self, views: int) -> Labelled:
         means, colors = (
@@ -88,20 +128,25 @@ class _Moving:
     """Unit normals of the spheres, body frame, shape (N, 3); None where they are unknown."""
     relighting: Relighting | None
     """Relighting of the spheres; None to keep the colours of the photos."""
+    harmonics: Tensor | None = None
+    """Harmonics of the colours from degree 1 on, body frame, shape (N, K, 3); None for colours equal from all sides."""
 
     def placed(self, position_m: Tensor, quat_wxyz: Tensor) -> Labelled:
         """Return the spheres at positions (n, 3) [m] and orientations (n, 4)."""
         rotations = quat_to_matrix(quat_wxyz)
         means = self.spheres.means @ rotations.transpose(1, 2) + position_m[:, None]
         colors = self.spheres.colors.expand(len(means), -1, -1)
+        brightness = torch.ones_like(colors[..., :1])
         if self.relighting is not None:
-            colors = (colors * self.relighting.turned(rotations)[..., None]).clamp(0, 1)
+            brightness = self.relighting.turned(rotations)[..., None]
+            colors = (colors * brightness).clamp(0, 1)
         return Labelled(
             means=means,
             scales=self.spheres.scales,
             opacities=self.spheres.opacities,
             colors=colors,
             labels=self.spheres.labels,
+            gloss=None if self.harmonics is None else Gloss(self.harmonics, rotations, brightness),
         )
 
 
@@ -128,12 +173,13 @@ class LabelledModel:
             if body.name not in model.body_splats:
                 continue
             splats = model.body_splats[body.name]
-            spheres = self._labelled(Spheres.from_numpy(splats, device=device), index + 1)
+            glossy = Spheres.from_numpy(splats, device=device)
+            spheres = self._labelled(glossy, index + 1)
             normals = None if splats.normals is None else self.tensor(splats.normals)
             if body.motion == "fixed":
-                self.fixed.append((index, self._fixed(spheres, body)))
+                self.fixed.append((index, self._fixed(spheres, body, glossy.harmonics)))
             else:
-                self.moving.append(_Moving(index, spheres, normals, None))
+                self.moving.append(_Moving(index, spheres, normals, None, glossy.harmonics))
         self._bodies = model.file.bodies
         self.set_light(model.file.light)
 
@@ -155,9 +201,10 @@ class LabelledModel:
 
     def still(self, camera: Camera) -> Labelled:
         """Return the background and the fixed bodies, in the colours that a camera sees."""
-        parts = [self.none, *(spheres for _, spheres in self.fixed)]
+        eye = self.tensor(camera.center)
+        parts = [self.none, *(spheres.seen_from(eye[None]) for _, spheres in self.fixed)]
         if self._scene is not None:
-            parts.insert(0, self._labelled(self._scene.seen_from(self.tensor(camera.center)), 0))
+            parts.insert(0, self._labelled(self._scene.seen_from(eye), 0))
         return Labelled.joined(parts)
 
     def placed(self, position_m: np.ndarray, quat_wxyz: np.ndarray) -> list[tuple[int, Labelled]]:
@@ -180,13 +227,8 @@ class LabelledModel:
             labels=labels,
         )
 
-    def _fixed(self, spheres: Labelled, body: BodyModel) -> Labelled:
+    def _fixed(self, spheres: Labelled, body: BodyModel, higher: Tensor | None) -> Labelled:
         rotation = quat_to_matrix(self.tensor(body.photo_pose.quat_wxyz))
         means = spheres.means @ rotation.T + self.tensor(body.photo_pose.position_m)
-        return Labelled(
-            means=means,
-            scales=spheres.scales,
-            opacities=spheres.opacities,
-            colors=spheres.colors,
-            labels=spheres.labels,
-        )
+        gloss = None if higher is None else Gloss(higher, rotation, torch.ones_like(spheres.colors[:, :1]))
+        return replace(spheres, means=means, gloss=gloss)

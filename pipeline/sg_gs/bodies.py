@@ -24,6 +24,7 @@ from .collision_spheres import distil, shape_to_spheres
 from .colors import VISIBLE_PX, mean_colors, observed_colors, spread_colors
 from .context import Stage
 from .depth_refinement import refine
+from .gloss import fit_gloss
 from .initialization import body_seeds, to_spheres
 from .losses import body_loss, geometry_loss
 from .optimize import Rates, Trainable, descend, detached, thinned
@@ -167,9 +168,13 @@ def _fit_spheres(stage: Stage, index: int, body: Body, solid: Volume) -> Spheres
         exposures=stage.exposures,
         slot=stage.slot(f"{body.name} colours"),
     )
-    record |= {"appearance_loss": thinned(losses), "seconds": round(time.perf_counter() - started, 2)}
+    fitted, gloss = detached(appearance.spheres()), {"degree": 0}
+    if config.gloss:
+        even = [stage.exposures.even(window) for window in windows]
+        fitted, gloss = fit_gloss(fitted, even, index, config.seed)
+    record |= {"appearance_loss": thinned(losses), "seconds": round(time.perf_counter() - started, 2), "gloss": gloss}
     stage.record[body.name] = stage.record.get(body.name, {}) | record
-    return detached(appearance.spheres())
+    return fitted
 
 
 def _say_unseen(name: str, solid: Volume, spheres: Spheres, seen: Tensor) -> int:

@@ -123,19 +123,6 @@ def test_colours_that_depend_on_the_direction_survive_the_file_and_reach_the_lab
     assert difference.mean() < 0.01
 
 
-def test_what_turns_has_one_colour_from_all_sides():
-    spheres = _spheres(5)
-    higher = torch.zeros(5, 3, 3)
-    with pytest.raises(ValueError, match="rotated"):
-        Spheres(
-            means=spheres.means,
-            scales=spheres.scales,
-            opacities=spheres.opacities,
-            colors=spheres.colors,
-            harmonics=higher,
-        ).moved(torch.eye(4))
-
-
 @pytest.mark.parametrize("bad", ["loss", "gradient"])
 def test_a_fit_that_diverges_ends_at_its_step(bad):
     truth = _spheres()
