@@ -1,4 +1,4 @@
-"""Separation of bodies from a scene without masks: by a box in the manifest, or by the ground and clustering.
+"""Separation of bodies from a scene without masks: by a box, by the ground and clustering, or by a plain background.
 
 An object is searched for on the ground (`object_search`), and a finer grid of spheres is fitted around it alone; a box
 in the manifest replaces the search. The result locates a body to about the spacing of the grid; `mask_segmentation`
@@ -16,7 +16,7 @@ import numpy as np
 from ...datasets.capture.capture import Capture
 from ...schemas import Body, Ground, InputDataError, PhotoBox, SplatConfig
 from ..geometry.solid_grid import Array
-from .mask_segmentation import Blob, outline
+from .mask_segmentation import Blob, Outlined, outline, outline_before_plain
 from .object_search import LEAST_SHARE, ObjectSearch, Region
 from .views import COVERED, View
 
@@ -24,12 +24,15 @@ _POOR = 0.9
 """Agreement of the masks below which a warning asks the user to check the picture."""
 
 
+_Method = Literal["box", "ground", "plain"]
+
+
 @dataclass(frozen=True)
 class BodyRecord:
     """How one body was separated."""
 
-    method: Literal["box", "ground"]
-    """How the body was found: by the box in the manifest, or by the ground and clustering."""
+    method: _Method
+    """How the body was found: by the box in the manifest, by the ground, or before a plain background."""
     clusters: int
     """Number of objects found on the ground, or in the box."""
     share: float
@@ -80,6 +83,10 @@ def separate(
     wanted = _without_masks(bodies, train)
     if not wanted:
         return None
+    if len(wanted) == 1 and ground is None and bodies[wanted[0]].photo_box is None:
+        plain = outline_before_plain(capture, train, test, wanted[0])
+        if plain is not None:
+            return _separation(plain, {bodies[wanted[0]].name: "plain"}, {})
     _refuse_the_unknowable(capture, [bodies[index] for index in wanted], ground)
     search = ObjectSearch(capture, train, ground, points, config)
     boxes = {index: _region(box) for index in wanted if (box := bodies[index].photo_box) is not None}
@@ -90,13 +97,20 @@ def separate(
         for index, (part, _) in zip(wanted, parts, strict=True)
     ]
     outlined = outline(capture, train, test, spheres, pitch, blobs, ground)
-    entries: dict[str, BodyRecord] = {}
-    for index, (_, count), share, agreement in zip(wanted, parts, outlined.shares, outlined.agreements, strict=True):
+    for index, share in zip(wanted, outlined.shares, strict=True):
         if share < LEAST_SHARE:
             raise search.empty(bodies[index].name, regions[index])
-        entries[bodies[index].name] = BodyRecord(
-            "box" if index in boxes else "ground", counts.get(index, count), round(share, 4), round(agreement, 4)
-        )
+    methods: dict[str, _Method] = {bodies[index].name: "box" if index in boxes else "ground" for index in wanted}
+    found = zip(wanted, parts, strict=True)
+    return _separation(outlined, methods, {bodies[k].name: counts.get(k, count) for k, (_, count) in found})
+
+
+def _separation(outlined: Outlined, methods: Mapping[str, _Method], counts: Mapping[str, int]) -> Separation:
+    figures = zip(methods.items(), outlined.shares, outlined.agreements, strict=True)
+    entries = {
+        name: BodyRecord(method, counts.get(name, 1), round(share, 4), round(agreement, 4))
+        for (name, method), share, agreement in figures
+    }
     record = {name: asdict(entry) for name, entry in entries.items()}
     warnings = tuple(text for name, entry in entries.items() for text in _remarks(name, entry))
     return Separation(outlined.train, outlined.test, record, warnings)
@@ -132,7 +146,7 @@ def _refuse_the_unknowable(capture: Capture, bodies: Sequence[Body], ground: Gro
         raise InputDataError(
             f"{capture.root}: body '{boxless[0]}' has neither a shape nor masks, and can be found neither by a box nor "
             "by the ground.",
-            "masks/ with its label, a shape, a photo_box, or (with metric cameras) a ground below it.",
+            "masks/ with its label, a shape, a photo_box, a plain background, or, with metric cameras, a ground.",
             todo,
         )
     if len(boxless) > 1:
@@ -145,7 +159,7 @@ def _refuse_the_unknowable(capture: Capture, bodies: Sequence[Body], ground: Gro
 
 
 def _remarks(name: str, entry: BodyRecord) -> list[str]:
-    where = "in its box" if entry.method == "box" else "on the ground"
+    where = {"box": "in its box", "ground": "on the ground", "plain": "before the plain background"}[entry.method]
     remarks = [
         f"body '{name}' has no masks: it was separated by what is {where}. separation.png shows the result; the "
         "held-out figures within the mask depend on it."

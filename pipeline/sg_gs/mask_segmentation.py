@@ -24,8 +24,9 @@ from ...schemas import Ground
 from ..geometry.solid_grid import Array, crossings, grid_points
 from ..geometry.spheres import Spheres
 from ..rendering.render import render
+from .plain_background import foreground
 from .views import View, with_labels
-from .visual_hull import largest_component, signed_distance_px
+from .visual_hull import carve, largest_component, signed_distance_px
 
 Mask = NDArray[np.bool_]
 
@@ -43,6 +44,8 @@ _GRID = 72
 _OUTVOTED = 0.05
 """Share of the photos that may exclude a point of the body and are outvoted."""
 _MIN_VIEWS = 3
+_RIM_PX = 3.0
+"""Half width of the band about what stands before a plain background [px]."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,32 @@ def outline(
     bodies = len(capture.manifest.bodies)
     found = [with_labels(view, known, bodies) for view, known in zip(views, labels, strict=True)]
     return Outlined(found[fitted], found[len(train) :], shares, agreements)
+
+
+def outline_before_plain(capture: Capture, train: Sequence[View], test: Sequence[View], index: int) -> Outlined | None:
+    """Add masks of the one body that all photos show before a plain background; None where one does not.
+
+    Args:
+        capture: The capture with the photos.
+        train: The photos that carve the solid.
+        test: Other photos to segment.
+        index: Index of the body in the manifest.
+    """
+    views, fitted = [*train, *test], slice(len(train))
+    pictures = [_Picture.read(capture, view) for view in views]
+    starts = [start for picture in pictures if (start := foreground(picture.image)) is not None]
+    if len(starts) < len(pictures):
+        return None
+    masks = [_cut(p.image, _Band.about(start, start, _RIM_PX)) for p, start in zip(pictures, starts, strict=True)]
+    labels = [np.where(mask, index + 1, 0).astype(np.uint8) for mask in masks]
+    bodies = len(capture.manifest.bodies)
+    found = [with_labels(view, own, bodies) for view, own in zip(views, labels, strict=True)]
+    silhouettes = [view.silhouette(index) for view in found[fitted]]
+    hull = carve([one for one in silhouettes if one is not None], None, capture.manifest.bodies[index].name)
+    nothing = [np.zeros(mask.shape, bool) for mask in masks]
+    agreement = _agreement(_Solid(hull.surface, hull.pitch), pictures[fitted], masks[fitted], nothing[fitted])
+    share = float(np.mean([mask.mean() for mask in masks[fitted]]))
+    return Outlined(found[fitted], found[len(train) :], [share], [agreement])
 
 
 @dataclass(frozen=True)
