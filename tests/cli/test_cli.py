@@ -254,7 +254,7 @@ def test_wrong_settings(run: Run, settings_seen: list[Any], tmp_path: Path) -> N
         2,
         "",
         "settings (--set calibrate.retrys=1): [calibrate] has an unknown field 'retrys'.\n"
-        "Allowed: seed, max_features, max_image_size, retries. Did you mean 'retries'?\n"
+        "Allowed: seed, max_features, max_image_size, retries, turntable. Did you mean 'retries'?\n"
         "Next: correct the field.\n",
     )
     missing = tmp_path / "none.toml"
