@@ -35,7 +35,7 @@ def capture_of(scene: Set, root: Path) -> None:
     """Write photos, masks and true cameras of a scene."""
     root.mkdir()
     take_photos(scene, root)
-    write_manifest(root / "capture.toml", manifest(scene).model_copy(update={"splits": {}, "video": None}))
+    write_manifest(root / "capture.toml", manifest(scene).model_copy(update={"splits": {}}))
     cameras = _cameras_file(scene).model_copy(update={"videos": {}})  # there are none of the motion
     (root / "cameras.json").write_text(cameras.model_dump_json() + "\n", encoding="utf-8")
 
