@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ..optimization.levenberg_marquardt import Solution
-from .innovations import WHITE, CorrelatedNoise, NoiseModel, matern
+from .innovations import MOST_NUMBERS, RESOLUTION_S, WHITE, CorrelatedNoise, NoiseModel, matern
 from .observations import Observations
 from .segmentation import Segment
 from .thresholds import TRACK_THRESHOLDS
@@ -105,22 +105,24 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
     kept = [w.without(LIMITS.wrong * float(np.median(sizes))) for w in windows]
     windows = [w for w in kept if len(w.left)]
     step = float(np.median([np.median(np.diff(w.times_s, axis=1)) for w in windows]))
-    alone, white_std = _likelihood(windows, CorrelatedNoise())
+    windows = [w.merged() for w in windows]
+    ((alone, white_std),) = _likelihoods(windows, [CorrelatedNoise()])
     if white_std == 0:  # values that never change, or repeat a polynomial to the last bit: there are no errors to see
         return _Found(CorrelatedNoise(), 0.0, 0.0)
-    tried = []
     gaps = step * torch.arange(1, FAR, dtype=torch.float64)
-    for order, remembered in itertools.product(SHARES, REMEMBERED):
-        time_s = -step / math.log(remembered)
-        alike = 1 + 2 * float(matern(gaps, time_s, order).sum())
-        for share in SHARES[order]:
-            noise = CorrelatedNoise(share, time_s, order=order)
-            likelihood, std = _likelihood(windows, noise)
-            slow = std**2 * (1 - share + share * alike)
-            tried.append((2 * (likelihood - alone), slow, noise, std))
-    most, _, _, likeliest = max(tried)
+    tried = [
+        CorrelatedNoise(share, -step / math.log(remembered), order=order)
+        for order, remembered in itertools.product(SHARES, REMEMBERED)
+        for share in SHARES[order]
+    ]
+    found = []
+    for noise, (likelihood, std) in zip(tried, _likelihoods(windows, tried), strict=True):
+        alike = 1 + 2 * float(matern(gaps, noise.time_s, noise.order).sum())
+        slow = std**2 * (1 - noise.share + noise.share * alike)
+        found.append((2 * (likelihood - alone), slow, noise, std))
+    most, _, _, likeliest = max(found)
     # forces are found from slow changes, where windows show the errors least: the larger slow part is the safe choice
-    likely = [(slow, noise, std) for evidence, slow, noise, std in tried if evidence > most - LIMITS.likely]
+    likely = [(slow, noise, std) for evidence, slow, noise, std in found if evidence > most - LIMITS.likely]
     _, noise, std = max(likely)
     return _Found(noise._replace(size=std / likeliest), likeliest, most)
 
@@ -147,16 +149,23 @@ class _Windows:
     """Orthonormal basis of the polynomials, shape (W, n, d)."""
     left: Array
     """What the polynomials leave of the measurements, shape (W, n, c) [m or rad]."""
+    columns: Array
+    """Number of the measured columns of each window, shape (W,); further ones are zero."""
 
     @property
-    def dof(self) -> int:
-        """Degrees of freedom of each window."""
-        return (self.left.shape[1] - self.basis.shape[2]) * self.left.shape[2]
+    def both(self) -> Array:
+        """Basis and residuals side by side, shape (W, n, d + c)."""
+        return np.concatenate((self.basis, self.left), 2)
+
+    @property
+    def dof(self) -> Array:
+        """Degrees of freedom of each window (W,)."""
+        return (self.left.shape[1] - self.basis.shape[2]) * self.columns
 
     @property
     def count(self) -> int:
         """Degrees of freedom of all windows."""
-        return len(self.left) * self.dof
+        return int(self.dof.sum())
 
     @property
     def variances(self) -> Array:
@@ -166,31 +175,49 @@ class _Windows:
     def without(self, above: float) -> _Windows:
         """Return the windows whose variance is at most a limit."""
         kept = self.variances <= above
-        return _Windows(self.times_s[kept], self.basis[kept], self.left[kept])
+        return _Windows(self.times_s[kept], self.basis[kept], self.left[kept], self.columns[kept])
+
+    def merged(self) -> _Windows:
+        """Return the windows with those of equal frame times as one: their covariance is decomposed once."""
+        grids = np.rint((self.times_s - self.times_s[:, :1]) / RESOLUTION_S)
+        _, first, place = np.unique(grids, axis=0, return_index=True, return_inverse=True)
+        groups = [self.left[place == k].swapaxes(0, 1).reshape(self.left.shape[1], -1) for k in range(len(first))]
+        columns = np.array([group.shape[1] for group in groups])
+        padded = [np.pad(group, ((0, 0), (0, columns.max() - group.shape[1]))) for group in groups]
+        return _Windows(self.times_s[first], self.basis[first], np.stack(padded), columns)
 
 
-def _likelihood(windows: Sequence[_Windows], noise: CorrelatedNoise) -> tuple[float, float]:
-    """Return the largest restricted log-likelihood of a noise model, and its standard deviation.
+def _likelihoods(windows: Sequence[_Windows], noises: Sequence[CorrelatedNoise]) -> list[tuple[float, float]]:
+    """Return the largest restricted log-likelihood of each of some noise models, and its standard deviation."""
+    largest = max(w.times_s.shape[1] * (w.times_s.shape[1] + w.both.shape[2]) * len(w.both) for w in windows)
+    some = max(1, MOST_NUMBERS // largest)
+    chunks = [noises[first : first + some] for first in range(0, len(noises), some)]
+    return [one for chunk in chunks for one in _likelihoods_together(windows, chunk)]
+
+
+def _likelihoods_together(windows: Sequence[_Windows], noises: Sequence[CorrelatedNoise]) -> list[tuple[float, float]]:
+    """Return what `_likelihoods` does, in one batch.
 
     Of the residuals of polynomials B of a covariance C: of the dof of all their contrasts, whose covariance has the
     determinant |C| |B' C^-1 B| (Harville 1974).
     """
-    square, logs, count = 0.0, 0.0, 0
+    square, logs = np.zeros(len(noises)), np.zeros(len(noises))
+    share = torch.tensor([noise.share for noise in noises], dtype=torch.float64)[:, None, None, None]
     for w in windows:
-        gap = np.abs(w.times_s[:, :, None] - w.times_s[:, None])
-        alike = matern(torch.from_numpy(gap), noise.time_s, noise.order)
-        together = noise.share * alike + (1 - noise.share) * torch.eye(gap.shape[1], dtype=torch.float64)
-        factor = torch.linalg.cholesky(together)
-        both = torch.from_numpy(np.concatenate((w.basis, w.left), 2))
-        basis, left = torch.linalg.solve_triangular(factor, both, upper=False).tensor_split([w.basis.shape[2]], 2)
+        gap = torch.from_numpy(np.abs(w.times_s[:, :, None] - w.times_s[:, None]))
+        alike = torch.stack([matern(gap, noise.time_s, noise.order) for noise in noises])
+        factor = torch.linalg.cholesky(share * alike + (1 - share) * torch.eye(gap.shape[1], dtype=torch.float64))
+        whitened = torch.linalg.solve_triangular(factor, torch.from_numpy(w.both), upper=False)
+        basis, left = whitened.tensor_split([w.basis.shape[2]], 3)
         inner = torch.linalg.cholesky(basis.mT @ basis)
         along = torch.linalg.solve_triangular(inner, basis.mT @ left, upper=False)
-        square += float(left.square().sum() - along.square().sum())
-        roots = (one.diagonal(dim1=1, dim2=2).log().sum() for one in (factor, inner))
-        logs += 2 * w.left.shape[2] * float(sum(roots))
-        count += w.count
-    variance = max(square / max(count, 1), 0.0)
-    return -0.5 * (logs + count * np.log(max(variance, 1e-300))), float(np.sqrt(variance))
+        square += (left.square().sum((1, 2, 3)) - along.square().sum((1, 2, 3))).numpy()
+        roots = [one.diagonal(dim1=2, dim2=3).log().sum(2) for one in (factor, inner)]
+        logs += 2 * ((roots[0] + roots[1]) @ torch.from_numpy(w.columns).to(gap)).numpy()
+    count = sum(w.count for w in windows)
+    variance = np.maximum(square / max(count, 1), 0.0)
+    likelihood = -0.5 * (logs + count * np.log(np.maximum(variance, 1e-300)))
+    return list(zip(likelihood.tolist(), np.sqrt(variance).tolist(), strict=True))
 
 
 def _windows(whole: Observations, flight: Sequence[Segment], kind: int) -> list[_Windows]:
@@ -217,7 +244,8 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int) -> list[
                 basis = np.linalg.qr(np.vander(scaled, degree + 1))[0]
                 left = values - basis @ (basis.T @ values)
                 found.setdefault((length, degree, values.shape[1]), []).append((t, basis, left))
-    return [_Windows(*(np.stack(parts) for parts in zip(*some, strict=True))) for some in found.values()]
+    stacked = [[np.stack(parts) for parts in zip(*some, strict=True)] for some in found.values()]
+    return [_Windows(*parts, np.full(len(parts[0]), parts[2].shape[2])) for parts in stacked]
 
 
 def _window(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> tuple[int, int]:
