@@ -283,7 +283,7 @@ def _of_impacts(
     extended, own = with_variants(world, variants, "contact")
     problem = replace(base.problem, world=extended, parameters=(*base.parameters, *own))
     value = torch.cat([torch.as_tensor(base.fit.values), torch.zeros(len(own)).to(base.centre)])
-    _, slopes = problem.linear(value)
+    slopes = problem.linear(value[None])[1][0]
     found = torch.einsum("nip,niq->npq", slopes, slopes).numpy()
     place = {p.name: len(base.parameters) + k for k, p in enumerate(own)}
     columns = tuple(tuple(place[name] for name in v.parameters) for v in variants)

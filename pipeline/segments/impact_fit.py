@@ -178,29 +178,39 @@ class ImpactProblem:
         found = (self.whitening @ self.residuals(values)[..., None])[..., 0]
         return torch.nan_to_num(found, nan=1e6, posinf=1e6, neginf=-1e6)
 
-    def linear(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals (n, 6) in sigmas at a value (P,), and their derivatives (n, 6, P) by differences."""
-        steps = STEP * torch.tensor([p.prior[1] for p in self.parameters]).to(value)
-        high = torch.tensor([p.limits[1] for p in self.parameters]).to(value)
+    def linear(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return residuals (K, n, 6) in sigmas at values (K, P), and their derivatives (K, n, 6, P) by differences."""
+        steps = STEP * torch.tensor([p.prior[1] for p in self.parameters]).to(values)
+        high = torch.tensor([p.limits[1] for p in self.parameters]).to(values)
         # step inwards where a step up would leave the bounds
-        steps = torch.where(value + steps > high, -steps, steps)
-        rows = self.rows(torch.cat([value[None], value + torch.diag(steps)]))
-        return rows[0], ((rows[1:] - rows[:1]) / steps[:, None, None]).movedim(0, -1)
+        steps = torch.where(values + steps > high, -steps, steps)
+        moved = torch.cat([values[:, None], values[:, None] + torch.diag_embed(steps)], 1)
+        rows = self.rows(moved.flatten(0, 1)).unflatten(0, moved.shape[:2])
+        return rows[:, 0], ((rows[:, 1:] - rows[:, :1]) / steps[:, :, None, None]).movedim(1, -1)
 
 
-def fit_impacts(
-    problem: ImpactProblem, start: Tensor, weight: Array | None = None, centre: Tensor | None = None
-) -> ImpactFit:
+def fit_impacts(problem: ImpactProblem, start: Tensor, centre: Tensor | None = None) -> ImpactFit:
     """Fit the parameters of a problem to its impacts.
 
     Args:
         problem: With weights.
         start: Values (P,) in fitted coordinates.
-        weight: Weight of each impact (n,); 1 by default.
         centre: Centres of the priors (P,); the start by default.
     """
-    counts = np.ones(len(problem.impacts)) if weight is None else weight
-    fitted = _WeightedImpacts(problem, torch.as_tensor(counts).to(start), start if centre is None else centre)
+    every = np.ones((1, len(problem.impacts)))
+    return fits_to_weighted(problem, start, every, start if centre is None else centre)[0]
+
+
+def fits_to_weighted(problem: ImpactProblem, start: Tensor, weights: Array, centre: Tensor) -> list[ImpactFit]:
+    """Fit the parameters of a problem to its impacts with several weights of each impact (G, n), all in one batch.
+
+    Args:
+        problem: With weights of the residuals.
+        start: Values (P,) in fitted coordinates.
+        weights: Weights of the impacts in each of the fits.
+        centre: Centres of the priors (P,).
+    """
+    fitted = _WeightedImpacts(problem, torch.as_tensor(weights).to(start), centre)
     policy = Policy(
         iterations=ITERATIONS,
         damping=0.0,
@@ -210,41 +220,39 @@ def fit_impacts(
         absolute=FALL,
         linearise_end=False,
     )
-    end = descend(fitted, Point(values=start[None]), policy)
-    value = end.point.values
-    return ImpactFit(
-        value[0].numpy(), end.information()[0].numpy(), problem.rows(value)[0].numpy(), float(fitted.box.cost(value))
-    )
+    end = descend(fitted, Point(values=start.expand(len(weights), -1)), policy)
+    values, costs = end.point.values, fitted.box.cost(end.point.values)
+    parts = zip(values.numpy(), end.information().numpy(), problem.rows(values).numpy(), costs.tolist(), strict=True)
+    return [ImpactFit(*part) for part in parts]
 
 
 class _WeightedImpacts(Problem):
-    """The parameters of a problem of impacts (n).
+    """The parameters of a problem of impacts (n), once for each weighting of them (G).
 
     Args:
         problem: The problem, with weights of its residuals.
-        weight: Weight of each impact, shape (n,).
+        weights: Weights of the impacts, shape (G, n).
         centre: Centres of the priors, shape (P,).
     """
 
-    def __init__(self, problem: ImpactProblem, weight: Tensor, centre: Tensor) -> None:
+    def __init__(self, problem: ImpactProblem, weights: Tensor, centre: Tensor) -> None:
         width = torch.tensor([p.prior[1] for p in problem.parameters]).to(centre)
         limits = torch.tensor([p.limits for p in problem.parameters]).to(centre)
-        self.problem, self.weight = problem, weight[:, None].expand(-1, 6)
-        self.owner = torch.zeros(1, dtype=torch.long)
-        self.box = Box.within(limits, centre, 1 / width.square())
+        self.problem, self.weights = problem, weights[:, :, None].expand(-1, -1, 6)
+        self.owner = torch.arange(len(weights))
+        one = Box.within(limits, centre, 1 / width.square())
+        self.box = one.at(torch.zeros(len(weights), dtype=torch.long))
 
     def costs(self, point: Point, rows: Rows) -> Tensor:
-        """Return the weighted chi2 (g,) at points of one group each."""
-        del rows
-        return (self.weight * self.problem.rows(point.values).square()).sum((-1, -2))
+        """Return the weighted chi2 (g,) at points of one weighting each."""
+        return (self.weights[rows.groups] * self.problem.rows(point.values).square()).sum((-1, -2))
 
     def linearised(self, point: Point, rows: Rows) -> NormalEquations:
         """Return the normal equations by the parameters."""
-        del rows
-        found, slope = self.problem.linear(point.values[0])
-        cost = (self.weight * found.square()).sum()
-        error, flat = found.flatten()[None], slope.flatten(0, 1)[None]
-        return NormalEquations.of_rows(error, flat, flat.shape[-1], cost[None], self.weight.flatten()[None])
+        found, slope = self.problem.linear(point.values)
+        weight = self.weights[rows.groups]
+        cost = (weight * found.square()).sum((-1, -2))
+        return NormalEquations.of_rows(found.flatten(1), slope.flatten(1, 2), slope.shape[-1], cost, weight.flatten(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +281,7 @@ class ImpactBase:
         problem, value = ImpactProblem(world, parameters, impacts), centre
         for _ in range(WEIGH_AGAIN):
             problem = problem.whitened(value)
-            fit = fit_impacts(problem, value, centre=centre)
+            fit = fit_impacts(problem, value, centre)
             value = torch.as_tensor(fit.values)
         return ImpactBase(problem, centre, fit)
 
@@ -291,12 +299,11 @@ class ImpactBase:
     def gains(self, problem: ImpactProblem, value: Array) -> Array:
         """Return the fall of each episode's chi2 by an effect whose parameters the other episodes determine."""
         episode = self.problem.impacts.episode
-        start = torch.as_tensor(value)
-        gains = []
-        for own in np.unique(episode):
-            others = (episode != own).astype(np.float64)
-            without = fit_impacts(self.problem, torch.as_tensor(self.fit.values), others, self.centre)
-            fitted = fit_impacts(problem, start, others, self.centre_of(start))
-            parts = [(fit.rows[episode == own] ** 2).sum() for fit in (without, fitted)]
-            gains.append(float(parts[0] - parts[1]))
-        return np.array(gains)
+        names = np.unique(episode)
+        others = (episode != names[:, None]).astype(np.float64)
+        starts = torch.as_tensor(self.fit.values), torch.as_tensor(value)
+        without = fits_to_weighted(self.problem, starts[0], others, self.centre)
+        fitted = fits_to_weighted(problem, starts[1], others, self.centre_of(starts[1]))
+        left = [[(one.rows[episode == own] ** 2).sum() for own, one in zip(names, fits, strict=True)]
+                for fits in (without, fitted)]  # fmt: skip
+        return np.array(left[0]) - np.array(left[1])

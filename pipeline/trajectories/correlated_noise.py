@@ -110,15 +110,14 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
     if white_std == 0:  # values that never change, or repeat a polynomial to the last bit: there are no errors to see
         return _Found(CorrelatedNoise(), 0.0, 0.0)
     gaps = step * torch.arange(1, FAR, dtype=torch.float64)
-    tried = [
-        CorrelatedNoise(share, -step / math.log(remembered), order=order)
-        for order, remembered in itertools.product(SHARES, REMEMBERED)
-        for share in SHARES[order]
-    ]
+    tried, alike = [], []
+    for order, remembered in itertools.product(SHARES, REMEMBERED):
+        time_s = -step / math.log(remembered)
+        tried += [CorrelatedNoise(share, time_s, order=order) for share in SHARES[order]]
+        alike += [1 + 2 * float(matern(gaps, time_s, order).sum())] * len(SHARES[order])
     found = []
-    for noise, (likelihood, std) in zip(tried, _likelihoods(windows, tried), strict=True):
-        alike = 1 + 2 * float(matern(gaps, noise.time_s, noise.order).sum())
-        slow = std**2 * (1 - noise.share + noise.share * alike)
+    for noise, far, (likelihood, std) in zip(tried, alike, _likelihoods(windows, tried), strict=True):
+        slow = std**2 * (1 - noise.share + noise.share * far)
         found.append((2 * (likelihood - alone), slow, noise, std))
     most, _, _, likeliest = max(found)
     # forces are found from slow changes, where windows show the errors least: the larger slow part is the safe choice
@@ -202,10 +201,12 @@ def _likelihoods_together(windows: Sequence[_Windows], noises: Sequence[Correlat
     determinant |C| |B' C^-1 B| (Harville 1974).
     """
     square, logs = np.zeros(len(noises)), np.zeros(len(noises))
+    laws = list(dict.fromkeys((noise.time_s, noise.order) for noise in noises))
+    which = [laws.index((noise.time_s, noise.order)) for noise in noises]
     share = torch.tensor([noise.share for noise in noises], dtype=torch.float64)[:, None, None, None]
     for w in windows:
         gap = torch.from_numpy(np.abs(w.times_s[:, :, None] - w.times_s[:, None]))
-        alike = torch.stack([matern(gap, noise.time_s, noise.order) for noise in noises])
+        alike = torch.stack([matern(gap, *law) for law in laws])[which]
         factor = torch.linalg.cholesky(share * alike + (1 - share) * torch.eye(gap.shape[1], dtype=torch.float64))
         whitened = torch.linalg.solve_triangular(factor, torch.from_numpy(w.both), upper=False)
         basis, left = whitened.tensor_split([w.basis.shape[2]], 3)

@@ -200,7 +200,7 @@ class ImpactStart:
         problem = replace(self.base.problem, world=neutral, parameters=(*BASE, *parameters))
         found = fit_impacts(problem, start, centre=centre)
         prior = torch.tensor([1 / p.prior[1] ** 2 for p in problem.parameters]).to(centre)
-        rows, slopes = problem.linear(torch.as_tensor(found.values))
+        rows, slopes = (one[0] for one in problem.linear(torch.as_tensor(found.values)[None]))
         impacts = self.base.problem.impacts
         excess = max(float(found.chi2.sum()) / (6 * len(impacts) - len(problem.parameters)), 1.0)
         record = {
