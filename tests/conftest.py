@@ -29,7 +29,14 @@ def one_thread() -> Iterator[None]:
 
 
 def pytest_collection_finish() -> None:
-    """Build the kernels of fits and rollouts with fewer optimisations; tests of the kernels themselves undo it."""
+    """Build the kernels of fits and rollouts with fewer optimisations; tests of the kernels themselves undo it.
+
+    No tensor of a test is spread over machines; what torch loads to see that takes two seconds of each worker.
+    """
+    if "torch" in sys.modules:
+        import torch.testing._comparison
+
+        torch.testing._comparison._HAS_DTENSOR = False
     if "cgwm.pipeline.physics.fused.host" in sys.modules:
         from cgwm.pipeline.physics.fused import host
         from helpers.fused_host import QUICK_FLAGS

@@ -34,13 +34,8 @@ def module_name(path: Path) -> str:
 
 
 @cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-@cache
 def nodes(path: Path) -> list[ast.AST]:
-    return list(ast.walk(parsed(path)))
+    return list(ast.walk(import_graph.parsed(path)))
 
 
 @cache
@@ -50,7 +45,7 @@ def import_edges() -> list[import_graph.Import]:
 
 def imports(path: Path, *, top_level: bool = False) -> Iterator[tuple[int, str]]:
     """Yield line and absolute name of all that a file imports; `TYPE_CHECKING` blocks count as well."""
-    tree = parsed(path)
+    tree = import_graph.parsed(path)
     package = module_name(path) if path.name == "__init__.py" else module_name(path).rpartition(".")[0]
     for node in tree.body if top_level else nodes(path):
         if isinstance(node, ast.Import):
@@ -195,7 +190,7 @@ def test_only_the_command_line_prints_on_stdout() -> None:
 @pytest.mark.parametrize("path", [path for path in FILES if path.name == "__init__.py"], ids=module_name)
 def test_all_is_complete(path: Path) -> None:
     module = importlib.import_module(module_name(path))
-    tree = parsed(path)
+    tree = import_graph.parsed(path)
     exported = getattr(module, "__all__", [])
     assert [name for name in exported if not hasattr(module, name)] == []
     assert len(exported) == len(set(exported))

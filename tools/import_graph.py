@@ -12,6 +12,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -74,29 +75,43 @@ def imports(found: Mapping[str, Path]) -> list[Import]:
     return [one for name, path in found.items() for one in _imports_of(name, path, found)]
 
 
+Statement = ast.Import | ast.ImportFrom
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    """Return the syntax tree of a source file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def _import_statements(
+    body: Iterable[ast.AST], typed: bool = False
+) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    """Return the import statements of a body and of all blocks in it, and whether they only serve type checkers."""
+    for node in body:
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield node, typed
+        test = getattr(node, "test", None)
+        inner = typed or "TYPE_CHECKING" in (getattr(test, "id", ""), getattr(test, "attr", ""))
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+            block = getattr(node, part, ())
+            if isinstance(block, list):
+                yield from _import_statements(block, inner)
+
+
 def _imports_of(name: str, path: Path, known: Mapping[str, Path]) -> Iterator[Import]:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    typed = {
-        id(node)
-        for block in ast.walk(tree)
-        if isinstance(block, ast.If)
-        and "TYPE_CHECKING" in (getattr(block.test, "id", ""), getattr(block.test, "attr", ""))
-        for node in ast.walk(block)
-    }
     package = ["cgwm", *name.split(".")]
     package = package if path.name == "__init__.py" else package[:-1]
-    for node in ast.walk(tree):
+    for node, typed in _import_statements(parsed(path).body):
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
             absolute = ".".join([*base, *([node.module] if node.module else [])]).removeprefix("cgwm").strip(".")
             names = [f"{absolute}.{alias.name}" for alias in node.names]
             targets = {one if one in known else absolute for one in names}
-        elif isinstance(node, ast.Import):
-            targets = {alias.name.removeprefix("cgwm.") for alias in node.names}
         else:
-            continue
+            targets = {alias.name.removeprefix("cgwm.") for alias in node.names}
         for target in sorted(targets & set(known) - {name}):
-            yield Import(name, target, node.lineno, id(node) in typed)
+            yield Import(name, target, node.lineno, typed)
 
 
 def room_of(module: str) -> str:
