@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -41,7 +42,7 @@ def variance_components(
     likelihood = RestrictedLikelihood(contrasts, level)
     fast = [_climbed(likelihood, [_coded(known)], (), order) for order in FALLS]
     plain, without = max(fast, key=lambda one: one[1])
-    starts = [[*_coded(one), np.log(max(one.size, 0.3)), np.log(t)] for one, _ in fast for t in STARTS_S]
+    starts = [[*_coded(one), math.log(max(one.size, 0.3)), math.log(t)] for one, _ in fast for t in STARTS_S]
     slow, with_slow = _climbed(likelihood, starts, ("slow",), plain.order)
     gain = 2 * (with_slow - without)
     best, reached, sway_gain = (slow, with_slow, 0.0) if gain > LIMITS.evidence else (plain, without, 0.0)
@@ -50,8 +51,8 @@ def variance_components(
     if level:
         span = float((contrasts.times_s[:, -1] - contrasts.times_s[:, 0]).median())
         kinds = ("slow", "sway") if best.slow else ("sway",)
-        start = [*_coded(best), *([np.log(best.slow), np.log(best.slow_time_s)] if best.slow else [])]
-        sway = np.log(4 * max(best.slow, best.size) / span**2)
+        start = [*_coded(best), *([math.log(best.slow), math.log(best.slow_time_s)] if best.slow else [])]
+        sway = math.log(4 * max(best.slow, best.size) / span**2)
         swaying, higher = _climbed(likelihood, [[*start, sway + more] for more in (0.0, 1.5)], kinds, best.order)
         sway_gain = 2 * (higher - reached)
         if sway_gain > LIMITS.sway_evidence:
@@ -62,9 +63,13 @@ def variance_components(
 
 def _coded(noise: CorrelatedNoise) -> list[float]:
     """Return the coordinates of white and fast noise: logarithms of two standard deviations and a time."""
-    white = noise.size * np.sqrt(max(1 - noise.share, 0.0))
-    fast = noise.size * np.sqrt(max(noise.share, 0.0))
-    return [np.log(max(white, 0.1)), np.log(max(fast, 0.1)), np.log(np.clip(noise.time_s, 2 * FASTEST_S, FAST_S / 1.5))]
+    white = noise.size * math.sqrt(max(1 - noise.share, 0.0))
+    fast = noise.size * math.sqrt(max(noise.share, 0.0))
+    return [
+        math.log(max(white, 0.1)),
+        math.log(max(fast, 0.1)),
+        math.log(min(max(noise.time_s, 2 * FASTEST_S), FAST_S / 1.5)),
+    ]
 
 
 def _climbed(
@@ -74,10 +79,10 @@ def _climbed(
 
     Scoring with average information, damped; it is no least-squares problem, and is not of `optimization`.
     """
-    std, times = (np.log(LEAST_STD), 6.0), (np.log(FASTEST_S), np.log(FAST_S))
+    std, times = (math.log(LEAST_STD), 6.0), (math.log(FASTEST_S), math.log(FAST_S))
     bounds = [std, std, times]
     if "slow" in kinds:
-        bounds += [(-9.0, 12.0), (np.log(SLOW_S[0]), np.log(SLOW_S[1]))]
+        bounds += [(-9.0, 12.0), (math.log(SLOW_S[0]), math.log(SLOW_S[1]))]
     if "sway" in kinds:
         bounds.append((-20.0, 20.0))
     low, high = np.transpose(bounds)

@@ -24,7 +24,7 @@ from pipeline.phys_geo.images.test_phys_images import FRAMES, NAMES, TRUTH, film
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = PhysConfig(supervise="images", device="cpu", step_s=0.003, population=8, generations=2, iterations=1)
-SHORT = 7
+SHORT = 5
 
 
 @pytest.fixture(autouse=True)
