@@ -45,12 +45,13 @@ def pytest_collection_finish() -> None:
 
 
 LONGEST = (
-    "test_diagnosis.py", "test_fused.py", "test_calibrate.py", "test_next_throw.py", "test_sg_gs.py",
-    "test_separation.py", "test_diagnosis_impacts.py", "test_scenes.py", "test_diagnosis_glides.py",
-    "test_diagnosis_lasting.py", "test_hidden_loop.py", "test_ellipse.py", "test_export.py", "test_image_fit.py",
-    "test_validate.py", "test_shards.py", "test_phys_images.py", "test_honest_supervision.py", "test_pose_histories.py",
-    "test_visual_collision.py", "test_photos.py", "test_compare.py", "test_releases.py", "test_video_input.py",
-    "test_fit_effects.py", "test_workers.py", "test_mystery.py", "test_slow_errors.py",
+    "test_fused.py", "test_calibrate.py", "test_separation.py", "test_fuzz.py", "test_diagnosis.py", "test_sg_gs.py",
+    "test_next_throw.py", "test_export.py", "test_compare.py", "test_validate.py", "test_shards.py",
+    "test_visual_collision.py", "test_diagnosis_glides.py", "test_scenes.py", "test_image_fit.py", "test_photos.py",
+    "test_diagnosis_impacts.py", "test_diagnosis_lasting.py", "test_effects.py", "test_rollout_batches.py",
+    "test_slow_errors.py", "test_video_input.py", "test_architecture.py", "test_trust.py", "test_phys_images.py",
+    "test_view.py", "test_checkpoint.py", "test_mystery.py", "test_pose_histories.py", "test_honest_supervision.py",
+    "test_fit_effects.py", "test_releases.py", "test_ellipse.py", "test_workers.py",
 )  # fmt: skip
 """Files that take 5 s or more of one core, the longest first."""
 

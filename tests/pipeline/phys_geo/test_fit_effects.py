@@ -188,8 +188,9 @@ def test_a_fit_that_was_begun_starts_at_the_worlds_numbers(monkeypatch: pytest.M
     assert [generations for _, generations in seen] == [2, 4]
 
 
-def test_a_child_has_its_own_warnings_and_not_its_parents(tmp_path: Path) -> None:
+def test_a_child_has_its_own_warnings_and_not_its_parents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The parent's fit of the physics is gone, and so is what it warned of; what its photos showed is still true."""
+    monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)
     root = tmp_path / "capture"
     (root / "tracks").mkdir(parents=True)
     text = ['format = "cgwm-capture/1"', "[world]", "ground = { normal = [0.0, 0.0, 1.0], offset_m = 0.0 }"]
@@ -197,7 +198,7 @@ def test_a_child_has_its_own_warnings_and_not_its_parents(tmp_path: Path) -> Non
     text += ['[splits]\ntrain = ["0"]']
     (root / "capture.toml").write_text("\n".join(text) + "\n")
     write_tracks(root / "tracks" / "0.csv", thrown(boxes(), 1)[0][1])
-    brief = BRIEF.model_copy(update={"generations": 2, "population": 8, "step_s": 0.003})
+    brief = BRIEF.model_copy(update={"generations": 2, "population": 8, "iterations": 1, "step_s": 0.003})
     fit(root, tmp_path / "m0", stage="phys-geo", phys_config=brief)
     path = tmp_path / "m0" / "model.json"
     parent = json.loads(path.read_text())
