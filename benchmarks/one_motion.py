@@ -69,7 +69,7 @@ def measure(job: Job) -> dict[str, Any]:
     """Return the friction of a fit with its interval and the true one, or why there is none."""
     try:
         plan = _plan(job)
-        fit = fit_physics(_world(plan, job.law), [_episode(plan, job.seed)], PhysConfig(), NOISE)
+        fit = fit_physics(true_shape_world(plan, job.law), [noisy_episode(plan, job.seed)], PhysConfig(), NOISE)
     except NotConvergedError as error:
         return {"not_run": error.found}
     found = next(one for one in fit.parameters if one.name == "friction")
@@ -84,15 +84,16 @@ def _plan(job: Job) -> ScenePlan:
     return plan_capture(item, job.object, job.material, cast(Task, job.task), job.seed, 0, job.engine)[0]
 
 
-def _world(plan: ScenePlan, law: str) -> World:
+def true_shape_world(plan: ScenePlan, law: str) -> World:
+    """Return the world of a fit to a plan's motion, with true shape and mass and one of the laws of the finger."""
     numbers = Numbers(plan.contact.natural_time, plan.contact.damping_ratio)
     world = true_world(plan.solid, spheres_of(plan.solid), plan.contact, plan.fingertip, numbers)
     return replace(world, pair_laws={}) if law == "shared" else world
 
 
-def _episode(plan: ScenePlan, seed: int) -> Episode:
-    """Return the training episode: noisy poses of the object, and the command of the finger."""
-    episode, rng = plan.episodes[0], np.random.default_rng([seed, 31])
+def noisy_episode(plan: ScenePlan, seed: int, number: int = 0) -> Episode:
+    """Return an episode, by default that of training: noisy poses of the object, and the command of the finger."""
+    episode, rng = plan.episodes[number], np.random.default_rng([seed, 31, number] if number else [seed, 31])
     times = np.arange(episode.frame_count) / plan.frame_rate
     pose = episode.motion.qpos[episode.motion.rows(times)]
     place = pose[:, :3] + NOISE[0] * rng.standard_normal((len(times), 3))

@@ -150,7 +150,12 @@ class Shooting:
         )
 
     def fit(
-        self, starts: Sequence[Tensor], iterations: int, best: int, done: Callable[[], object] = lambda: None
+        self,
+        starts: Sequence[Tensor],
+        iterations: int,
+        best: int,
+        continued: int | None = None,
+        done: Callable[[], object] = lambda: None,
     ) -> list[ShootingFit]:
         """Minimise the cost from several starts of the parameters and from both first guesses of the states.
 
@@ -161,6 +166,7 @@ class Shooting:
             starts: Starts of the parameters in fitted coordinates, each of shape (P,).
             iterations: Maximum number of steps in each descent.
             best: Number of descents that are continued.
+            continued: Maximum number of steps in each continued descent; `iterations` by default.
             done: Called after each descent.
 
         Returns:
@@ -175,7 +181,7 @@ class Shooting:
         shots = []
         for shot, states in sorted(first, key=lambda one: one[0].cost)[:best]:
             tied = replace(self, tie=self._allowed(shot.shared, states))
-            shots.append(tied._minimised(shot.shared, states, iterations)[0])
+            shots.append(tied._minimised(shot.shared, states, continued or iterations)[0])
             done()
         return sorted(shots, key=lambda shot: shot.cost)
 
