@@ -246,7 +246,7 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int) -> list[
                 left = values - basis @ (basis.T @ values)
                 found.setdefault((length, degree, values.shape[1]), []).append((t, basis, left))
     stacked = [[np.stack(parts) for parts in zip(*some, strict=True)] for some in found.values()]
-    return [_Windows(*parts, np.full(len(parts[0]), parts[2].shape[2])) for parts in stacked]
+    return [_Windows(t, basis, left, np.full(len(t), left.shape[2])) for t, basis, left in stacked]
 
 
 def _window(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> tuple[int, int]:
