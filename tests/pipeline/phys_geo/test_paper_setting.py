@@ -8,6 +8,8 @@ import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.models.mjcf import write_mjcf
 from cgwm.datasets.models.model import read_model, write_model
+from cgwm.pipeline.control.task_world import require_rigid
+from cgwm.pipeline.diagnose import stage
 from cgwm.pipeline.phys_geo.paper_setting import paper_config
 from cgwm.pipeline.physics import ContactLaw, PaperLaw, World
 from cgwm.pipeline.physics.parameters import apply_parameters, contact_parameters
@@ -75,3 +77,7 @@ def test_an_unknown_law_is_refused_with_the_two_there_are() -> None:
 def test_what_knows_our_law_alone_refuses_it() -> None:
     with pytest.raises(InputDataError, match="contact law 'paper', which MJCF does not take"):
         write_mjcf(published())
+    with pytest.raises(InputDataError, match="contact law 'paper', which control does not take"):
+        require_rigid(published())
+    with pytest.raises(InputDataError, match="contact law 'paper', which diagnose does not take"):
+        stage._world(published(), capture())
