@@ -321,7 +321,7 @@ def test_a_law_found_is_saved_and_fitted(tmp_path: Path) -> None:
     truth = replace(truth, effects=(ActiveEffect.of(load_effect(f"{file}:Stranger"), {"c": 0.2}),))
     root, law, fitted = tmp_path / "capture", tmp_path / "my_law.py", tmp_path / "m1"
     # high up, where nothing touches
-    model = write_capture(root, truth, tosses(truth, 3, 5, 0.35, 60.0, height_m=(1.2, 1.6)), test=1)
+    model = write_capture(root, truth, tosses(truth, 3, 4, 0.3, 60.0, height_m=(1.2, 1.6)), test=1)
     run = CliRunner().invoke
     done = run(app, ["diagnose", str(model), str(root), "--save-law", str(law), "--json"])
     assert done.exit_code == 0, done.output
