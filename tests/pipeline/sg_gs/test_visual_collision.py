@@ -15,7 +15,8 @@ from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import ContactParameters, SynthesizeConfig, UsageError
 from pipeline.sg_gs.test_sg_gs import CONFIG, PLACE, RADIUS, make_capture, quick, write_manifest  # noqa: F401 (a fixture)
 
-VISUAL = CONFIG.model_copy(update={"collision": "visual", "iterations": 4, "max_scene_spheres": 100})
+BRIEF = {"iterations": 4, "max_scene_spheres": 100, "bare_ground": False}
+VISUAL = CONFIG.model_copy(update={"collision": "visual", **BRIEF})
 
 
 @pytest.fixture(scope="module")
