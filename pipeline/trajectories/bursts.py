@@ -150,8 +150,9 @@ def _found(path: _Path, sigma: float) -> NDArray[np.int64]:
         row = _worst(path, sigma)
         if row is None:
             break
-        wrong.append(path.frames[row])
-        middle_s.append(float(path.time_s[row].mean()))
+        if row.sum() >= LIMITS.least_burst:
+            wrong.append(path.frames[row])
+            middle_s.append(float(path.time_s[row].mean()))
         path = path.without(row)
     none = every.frames[:0]
     if not wrong or path.free < LEAST_FREE or len(path.frames) < (1 - LIMITS.burst_most[1]) * len(every.frames):
