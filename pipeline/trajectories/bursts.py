@@ -52,6 +52,8 @@ class _Path:
     """Coordinates (n, c) [m or rad]."""
     basis: Array
     """Functions of time that each coordinate may follow, (c, n, q)."""
+    free_s: float
+    """Time from which rows may be wrong [s]: before, a hand may still hold the body (`release_detection`)."""
 
     def without(self, wrong: NDArray[np.bool_]) -> _Path:
         """Leave out frames."""
@@ -130,7 +132,9 @@ def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path |
         # a marker beside the centre of mass turns with the body
         turn = CubicSpline(t[known], quat_to_matrix(quat).numpy()[known])(t)[:, axes].swapaxes(0, 1)
         basis = np.concatenate((basis, turn), 2)
-    path = _Path(item.episode, column, frames.numpy(), t, values.astype(np.float64), basis)
+    opens = item.first <= int((whole.seen[item.episode].amax(-1) > 0).to(torch.int64).argmax())
+    free_s = t[0] + LIMITS.longest_burst_s * opens
+    path = _Path(item.episode, column, frames.numpy(), t, values.astype(np.float64), basis, free_s)
     return path if path.free >= LEAST_FREE else None
 
 
@@ -170,7 +174,7 @@ def _worst(path: _Path, sigma: float) -> NDArray[np.bool_] | None:
     step = float(np.median(np.diff(path.time_s)))
     side = max(int(LIMITS.burst_sides[0]), round(LIMITS.burst_sides[1] / step))
     longest = min(1 + int(LIMITS.longest_burst_s / step), path.free - LEAST_FREE, count - 2 * side)
-    starts = np.arange(side, count - side)
+    starts = np.arange(max(side, int(np.searchsorted(path.time_s, path.free_s))), count - side)
     if longest < 1 or not len(starts):
         return None
     rows = starts[:, None] + np.arange(longest)

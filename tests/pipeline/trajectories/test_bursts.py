@@ -28,7 +28,7 @@ def found(world: object, episodes: Episodes) -> dict[tuple[int, int], list[int]]
     return {(kind, episode): frames.tolist() for kind in (0, 1) for episode, frames, _ in bursts(whole, flight, kind)}
 
 
-@pytest.mark.parametrize("first", [8, 27])
+@pytest.mark.parametrize("first", [13, 27])
 def test_a_row_of_wrong_positions_is_found_and_no_other_frame(first: int) -> None:
     world, episodes = flights()
     rng = np.random.default_rng(first)
@@ -36,6 +36,12 @@ def test_a_row_of_wrong_positions_is_found_and_no_other_frame(first: int) -> Non
     rows = found(world, episodes)
     assert set(rows) == {(0, 1)}
     assert set(rows[0, 1]) <= set(range(first, first + 5)) and len(rows[0, 1]) >= 4
+
+
+def test_the_first_tenth_of_a_second_is_left_to_the_search_for_hands() -> None:
+    world, episodes = flights()
+    track_of(episodes[1]).position_m[6:9] += 12 * NOISE[0] * np.random.default_rng(1).standard_normal((3, 3))
+    assert (0, 1) not in found(world, episodes)
 
 
 def test_a_lasting_force_and_a_marker_beside_the_centre_are_no_bursts() -> None:
