@@ -47,7 +47,7 @@ class _Topics(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class StreamGeometry:
     """Intrinsics of a stream, and its pose against the reference stream."""
 
@@ -111,12 +111,16 @@ class RealSenseFile:
         if self._old:
             info = self._topics.read(f"{stream}/info/camera_info")
             size, K, D = (int(info.width), int(info.height)), np.array(info.K, float), np.array(info.D, float)
-            return StreamGeometry(size, _matrix(K.reshape(3, 3), self.path), str(info.distortion_model), D, R, t)
+            K, lens = _matrix(K.reshape(3, 3), self.path), str(info.distortion_model)
+            return StreamGeometry(size=size, K=K, lens=lens, distortion=D, R_stream_reference=R, t_stream_reference=t)
         values = _values(self._topics.read(f"{stream}/camera_info").data)
         fx, fy, cx, cy = (float(values[name]) for name in ("fx", "fy", "ppx", "ppy"))
         K = _matrix(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), self.path)
         size = int(values["width"]), int(values["height"])
-        return StreamGeometry(size, K, values["model"], np.array(values["coeffs"].split(","), float), R, t)
+        D = np.array(values["coeffs"].split(","), float)
+        return StreamGeometry(
+            size=size, K=K, lens=values["model"], distortion=D, R_stream_reference=R, t_stream_reference=t
+        )
 
     def _pose(self, stream: str) -> tuple[Array, Array]:
         topic = next((name for name in self._names if name.startswith(f"{stream}/tf/")), None)

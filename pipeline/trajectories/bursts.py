@@ -36,7 +36,7 @@ LEAST_FREE = 8
 """Fewest frames of a flight beside a burst and the coefficients of its path."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Path:
     """One kind of measurement of one flight, and the smooth paths that it may follow."""
 
@@ -134,7 +134,15 @@ def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path |
         basis = np.concatenate((basis, turn), 2)
     opens = item.first <= int((whole.seen[item.episode].amax(-1) > 0).to(torch.int64).argmax())
     free_s = t[0] + LIMITS.longest_burst_s * opens
-    path = _Path(item.episode, column, frames.numpy(), t, values.astype(np.float64), basis, free_s)
+    path = _Path(
+        episode=item.episode,
+        column=column,
+        frames=frames.numpy(),
+        time_s=t,
+        values=values.astype(np.float64),
+        basis=basis,
+        free_s=free_s,
+    )
     return path if path.free >= LEAST_FREE else None
 
 
