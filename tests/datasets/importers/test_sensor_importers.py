@@ -239,8 +239,9 @@ def test_realsense_gives_frames_intrinsics_and_depth_in_their_pixels(tmp_path: P
 def test_depth_of_a_turned_camera_is_where_the_colour_camera_sees_it() -> None:
     turn = Rotation.from_euler("xyz", [0.05, -0.2, 0.1]).as_matrix()
     K = np.array([[100.0, 0, 49.5], [0, 100.0, 39.5], [0, 0, 1]])
-    color = StreamGeometry((100, 80), K, "None", np.zeros(5), np.eye(3), np.zeros(3))
-    depth = StreamGeometry((100, 80), K, "None", np.zeros(5), turn, np.array([0.05, 0.01, -0.02]))
+    lens = {"size": (100, 80), "K": K, "lens": "None", "distortion": np.zeros(5)}
+    color = StreamGeometry(**lens, R_stream_reference=np.eye(3), t_stream_reference=np.zeros(3))
+    depth = StreamGeometry(**lens, R_stream_reference=turn, t_stream_reference=np.array([0.05, 0.01, -0.02]))
     x, y = np.meshgrid(np.arange(100), np.arange(80))
     rays = np.stack([(x - 49.5) / 100, (y - 39.5) / 100, np.ones(x.shape)], -1) @ turn  # in axes of the colour camera
     origin = -turn.T @ depth.t_stream_reference
