@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,8 @@ from ...datasets.models.model import Model
 from ...schemas import ArticulationModel
 from ..physics.chain import chain_of_model
 
+Pose = tuple[np.ndarray, np.ndarray]
+"""Position [m] (3,) and rotation matrix (3, 3)."""
 _MOST = 1.0
 """Largest value of a joint without limits [rad or m]."""
 
@@ -25,7 +27,7 @@ class Places:
     """Name of the root."""
     joints: dict[str, float]
     """Values of the joints that move [rad or m], by name."""
-    places: dict[str, tuple[np.ndarray, np.ndarray]]
+    places: dict[str, Pose]
     """Position [m] (3,) and rotation matrix (3, 3) of each link in the root's frame, by name."""
 
 
@@ -44,9 +46,25 @@ def chain_places(model: Model, one: ArticulationModel, rng: np.random.Generator)
     return Places(one.root, dict(zip(chain.joint_names, map(float, values), strict=True)), places)
 
 
-def deviation(
-    found: Mapping[str, tuple[np.ndarray, np.ndarray]], wanted: Mapping[str, tuple[np.ndarray, np.ndarray]]
+def worst_deviation(
+    model: Model, seed: int, places_of: Callable[[ArticulationModel, Places], Mapping[str, Pose]]
 ) -> tuple[float, float]:
+    """Return the largest distance [mm] and angle [deg] of links at random values of all joints; 0 without joints.
+
+    Args:
+        model: The model.
+        seed: Seed of the values.
+        places_of: Gives the poses of the links of a jointed body in the exported file, relative to the root.
+    """
+    rng, worst = np.random.default_rng(seed), (0.0, 0.0)
+    for one in model.file.articulations:
+        wanted = chain_places(model, one, rng)
+        away = deviation(places_of(one, wanted), wanted.places)
+        worst = max(worst[0], away[0]), max(worst[1], away[1])
+    return worst
+
+
+def deviation(found: Mapping[str, Pose], wanted: Mapping[str, Pose]) -> tuple[float, float]:
     """Return the largest distance [mm] and angle [deg] between poses of the same names."""
     away = [1e3 * float(np.linalg.norm(found[name][0] - place)) for name, (place, _) in wanted.items()]
     turns = [Rotation.from_matrix(found[name][1].T @ turn).magnitude() for name, (_, turn) in wanted.items()]

@@ -10,10 +10,7 @@ from scipy.spatial.transform import Rotation
 from ...datasets.exports.sdf import joint_names
 from ...datasets.models.model import Model
 from ...schemas import ArticulationModel, InputDataError
-from .chain_places import Places, chain_places, deviation
-
-Pose = tuple[np.ndarray, np.ndarray]
-"""Position [m] (3,) and rotation matrix (3, 3)."""
+from .chain_places import Places, Pose, worst_deviation
 
 
 def sdf_deviation(model: Model, root: ET.Element, seed: int) -> tuple[float, float]:
@@ -32,12 +29,7 @@ def sdf_deviation(model: Model, root: ET.Element, seed: int) -> tuple[float, flo
         raise InputDataError(
             f"{model.place}: read again, the SDF has no model '{lacking[0]}'.", todo="report this as a bug."
         )
-    rng, worst = np.random.default_rng(seed), (0.0, 0.0)
-    for one in model.file.articulations:
-        places = chain_places(model, one, rng)
-        away = deviation(_places(found[one.name], one, places), places.places)
-        worst = max(worst[0], away[0]), max(worst[1], away[1])
-    return worst
+    return worst_deviation(model, seed, lambda one, wanted: _places(found[one.name], one, wanted))
 
 
 def _places(document: ET.Element, one: ArticulationModel, wanted: Places) -> dict[str, Pose]:

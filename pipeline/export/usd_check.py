@@ -13,10 +13,7 @@ from ...datasets.exports.usd import prim_name
 from ...datasets.models.model import Model
 from ...schemas import ContactParameters, InputDataError
 from ..physics.contact_law import restitution
-from .chain_places import Places, chain_places, deviation
-
-Pose = tuple[np.ndarray, np.ndarray]
-"""Position [m] (3,) and rotation matrix (3, 3)."""
+from .chain_places import Places, Pose, worst_deviation
 
 
 def restitutions(model: Model) -> dict[str, float]:
@@ -45,12 +42,7 @@ def usd_deviation(model: Model, text: str, seed: int) -> tuple[float, float]:
         raise InputDataError(
             f"{model.place}: opened again, the stage has no body '{lacking[0]}'.", todo="report this as a bug."
         )
-    rng, worst = np.random.default_rng(seed), (0.0, 0.0)
-    for one in model.file.articulations:
-        wanted = chain_places(model, one, rng)
-        found = deviation(_places(stage, wanted), wanted.places)
-        worst = max(worst[0], found[0]), max(worst[1], found[1])
-    return worst
+    return worst_deviation(model, seed, lambda _, wanted: _places(stage, wanted))
 
 
 def opened(text: str) -> Any:
