@@ -54,6 +54,8 @@ class SplatConfig(FileModel):
     """Learn a gain of each colour channel for every photo: for photos whose exposure or white balance varies."""
     refine_poses: bool = False
     """Refine the poses of the photos' cameras first; the model then holds them in `cameras.json`."""
+    flat_faces: bool = True
+    """Put the faces of bodies on planes where held-out photos agree on these at least as well."""
     gloss: bool = False
     """Let colours of bodies depend on the direction of view where held-out photos are repeated better so."""
     bare_ground: bool = True

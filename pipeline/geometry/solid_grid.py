@@ -11,6 +11,9 @@ from scipy.spatial import KDTree
 
 Array = NDArray[Any]
 
+_BESIDE = 2.0
+"""Largest distance between a point of a flat face and the foot of a point that it is nearest to, in pitches."""
+
 
 @dataclass(frozen=True)
 class MassProperties:
@@ -26,6 +29,47 @@ class MassProperties:
     def shifted(self, offset: Array) -> MassProperties:
         """Return the properties of the solid translated by `offset` (3,) [m], in the same frame."""
         return MassProperties(self.volume_m3, self.com_m + offset, self.inertia_m2)
+
+
+@dataclass(frozen=True)
+class Faces:
+    """Flat faces of a solid."""
+
+    planes: Array
+    """Unit outward normal n and offset h [m] of each, n . x = h, shape (F, 4)."""
+    of_point: NDArray[np.intp]
+    """Number of the face on which each point of the surface lies, -1 for none, shape (S,); empty without faces."""
+
+    def distance(self, points: Array, nearest: NDArray[np.intp], away: Array, beside_m: float) -> Array:
+        """Return distances from the surface [m], exact where the nearest point of the surface lies on a flat face.
+
+        Args:
+            points: Points, shape (n, 3) [m].
+            nearest: Number of the point of the surface that is nearest to each, shape (n,).
+            away: Distance from it [m], shape (n,).
+            beside_m: Largest distance between that point and the foot on the plane [m]; farther, the foot lies beside
+                the face.
+        """
+        if not len(self.planes):
+            return away
+        face = self.of_point[nearest]
+        plane = self.planes[face]
+        height = np.abs((points * plane[:, :3]).sum(1) - plane[:, 3])
+        return np.where((face >= 0) & (away**2 - height**2 < beside_m**2), height, away)
+
+    def with_normals(self, normals: Array) -> Array:
+        """Return the normals (S, 3) of the points of the surface, those of the planes for points on flat faces."""
+        if not len(self.planes):
+            return normals
+        return np.where(self.of_point[:, None] >= 0, self.planes[self.of_point, :3], normals)
+
+    def moved(self, rotation: Array, offset: Array) -> Faces:
+        """Return the faces after x -> rotation x + offset [m]."""
+        normals = self.planes[:, :3] @ rotation.T
+        return Faces(np.c_[normals, self.planes[:, 3] + normals @ offset], self.of_point)
+
+
+NO_FACES = Faces(np.zeros((0, 4)), np.zeros(0, np.intp))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +88,17 @@ class Volume:
     """Outward unit normals at `surface`, shape (S, 3)."""
     corner_count: int = 0
     """Number of points at the end of `surface` that are tips finer than the grid."""
+    faces: Faces = NO_FACES
+    """Flat faces, and which points of the surface lie on them."""
 
     @staticmethod
     def from_inside(
-        inside: NDArray[np.bool_], origin: Array, pitch: float, surface: Array, corner_count: int = 0
+        inside: NDArray[np.bool_],
+        origin: Array,
+        pitch: float,
+        surface: Array,
+        corner_count: int = 0,
+        faces: Faces = NO_FACES,
     ) -> Volume:
         """Build a volume from an occupancy grid and accurate points on its surface.
 
@@ -57,12 +108,14 @@ class Volume:
             pitch: Grid spacing [m].
             surface: Points on the surface [m], at most about a pitch apart, shape (S, 3).
             corner_count: Number of points at the end of `surface` that are tips finer than the grid.
+            faces: Flat faces of the solid; the distance to a flat face is exact.
         """
-        away = _distance_to(surface, inside.shape, np.asarray(origin, float), pitch)
+        away = _distance_to(surface, inside.shape, np.asarray(origin, float), pitch, faces)
         distance = np.where(inside, -away, away)
         gradient = np.stack([np.gradient(distance, pitch, axis=k) for k in range(3)], -1)
         normals = np.stack([_interpolate(gradient[..., k], origin, pitch, surface) for k in range(3)], 1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        normals = faces.with_normals(normals)
         return Volume(
             origin=np.asarray(origin, float),
             pitch=pitch,
@@ -70,6 +123,7 @@ class Volume:
             surface=surface,
             normals=normals,
             corner_count=corner_count,
+            faces=faces,
         )
 
     def at(self, points: Array) -> Array:
@@ -85,6 +139,11 @@ class Volume:
     def corners(self) -> Array:
         """Tips that are finer than the grid [m], shape (corner_count, 3)."""
         return self.surface[len(self.surface) - self.corner_count :]
+
+    def depth(self, points: Array) -> Array:
+        """Return the distance (n,) [m] of points (n, 3) [m] from the surface: of no grid, and exact at flat faces."""
+        away, nearest = (np.asarray(found) for found in KDTree(self.surface).query(points))
+        return self.faces.distance(points, nearest, away, _BESIDE * self.pitch)
 
     def size(self) -> float:
         """Return the diagonal of the surface's bounding box [m]."""
@@ -125,7 +184,7 @@ def crossings(field: Array, origin: Array, pitch: float) -> Array:
     return np.concatenate(found) if found else np.zeros((0, 3))
 
 
-def _distance_to(surface: Array, shape: tuple[int, ...], origin: Array, pitch: float) -> Array:
+def _distance_to(surface: Array, shape: tuple[int, ...], origin: Array, pitch: float, faces: Faces) -> Array:
     """Return the distance [m] from each grid point to the nearest surface point, shape (X, Y, Z)."""
     from scipy.ndimage import distance_transform_edt
 
@@ -134,12 +193,13 @@ def _distance_to(surface: Array, shape: tuple[int, ...], origin: Array, pitch: f
     representative[tuple(cells.T)] = np.arange(surface.shape[0])
     nearest = np.asarray(distance_transform_edt(representative < 0, return_distances=False, return_indices=True))
     points = grid_points(shape, origin, pitch)
-    away = np.linalg.norm(points - surface[representative[tuple(nearest)].reshape(-1)], axis=1)
+    found = representative[tuple(nearest)].reshape(-1)
+    away = np.linalg.norm(points - surface[found], axis=1)
     # Above, one point represents a cell; near the surface the exact nearest point is searched instead. A tree search
     # for all grid points would be slow: in the middle of a solid, many points are about equally near.
     near = away < 3 * pitch
-    away[near], _ = KDTree(surface).query(points[near])
-    return away.reshape(shape)
+    away[near], found[near] = KDTree(surface).query(points[near])
+    return faces.distance(points, found, away, _BESIDE * pitch).reshape(shape)
 
 
 def _interpolate(values: Array, origin: Array, pitch: float, points: Array) -> Array:

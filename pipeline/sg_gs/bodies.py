@@ -24,6 +24,7 @@ from .collision_spheres import distil, shape_to_spheres
 from .colors import VISIBLE_PX, mean_colors, observed_colors, spread_colors
 from .context import Stage
 from .depth_refinement import refine
+from .facets import flatten_faces
 from .gloss import fit_gloss
 from .initialization import body_seeds, to_spheres
 from .losses import body_loss, geometry_loss
@@ -126,13 +127,17 @@ def _contact_properties(
 
 def _hull(stage: Stage, index: int, body: Body) -> Volume:
     silhouettes = [view.silhouette(index) for view in stage.train]
-    hull = carve([one for one in silhouettes if one is not None], stage.ground, body.name)
-    if any(view.depth_map is not None for view in stage.train):
-        return hull  # The depth maps have carved it already, so the photos need not be compared.
-    solid, refinement = refine(
-        hull, [view for view in stage.train if view.labels is not None], index, stage.config.seed
-    )
-    stage.record[body.name] = {"refinement": asdict(refinement)}
+    solid = carve([one for one in silhouettes if one is not None], stage.ground, body.name)
+    views, seed = [view for view in stage.train if view.labels is not None], stage.config.seed
+    record: dict[str, Any] = {}
+    if all(view.depth_map is None for view in stage.train):  # else the maps have carved it already
+        solid, refinement = refine(solid, views, index, seed)
+        record["refinement"] = asdict(refinement)
+    if stage.config.flat_faces:
+        note(f"{body.name}: flat faces")
+        solid, faces = flatten_faces(solid, views, index, seed)
+        record["flat_faces"] = asdict(faces)
+    stage.record[body.name] = record
     return solid
 
 
@@ -227,13 +232,20 @@ def _moved(solid: Volume, T_to_from: Array) -> Volume:
     """Return a solid in another frame, on a grid of that frame."""
     rotation, offset = T_to_from[:3, :3], T_to_from[:3, 3]
     if np.allclose(rotation, np.eye(3)):
-        return replace(solid, origin=solid.origin + offset, surface=solid.surface + offset)
+        return replace(
+            solid,
+            origin=solid.origin + offset,
+            surface=solid.surface + offset,
+            faces=solid.faces.moved(np.eye(3), offset),
+        )
     surface = solid.surface @ rotation.T + offset
     origin = surface.min(0) - 3 * solid.pitch
     shape = tuple(int(n) for n in np.ceil((surface.max(0) - origin) / solid.pitch).astype(int) + 4)
     points = (grid_points(shape, origin, solid.pitch) - offset) @ rotation
     inside = (solid.at(points) < 0).reshape(shape)
-    return Volume.from_inside(inside, origin, solid.pitch, surface, solid.corner_count)
+    return Volume.from_inside(
+        inside, origin, solid.pitch, surface, solid.corner_count, solid.faces.moved(rotation, offset)
+    )
 
 
 def _turned(properties: MassProperties, T_to_from: Array) -> MassProperties:

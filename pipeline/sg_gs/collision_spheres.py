@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, KDTree, QhullError
 from scipy.spatial.distance import cdist
 
 from ...datasets.shapes.meshes import Mesh
@@ -40,6 +40,9 @@ _SMALLEST_RADIUS = 2e-3
 _SUPPORT_SHARE = 0.7
 _FILL_SHARE = 0.08
 _SAMPLES = 4000
+_SEATED_PITCHES = 0.3
+"""How near a flat face a sphere lies that is resized until it touches it, in pitches of the grid."""
+_SWEEPS = 4
 _CORNER_RADIUS_M = 2.5e-4
 _BARE_SHARE = 0.4
 """Largest gap between a mesh and its spheres, in units of its size: a plate in eight spheres has 0.33, and a solid that
@@ -158,7 +161,42 @@ def distil(solid: Solid, max_spheres: int, first: tuple[Array, Array] | None = N
             "solid shapes that are not thin for their length.",
             "divide a long thin body into shorter ones, or give it spheres: shape = { splats = { path = ... } }.",
         )
-    return _measured(solid, points, *chosen.arrays())
+    centers, radii = chosen.arrays()
+    if isinstance(solid, Volume):
+        centers, radii = _seated(solid, centers, radii)
+    return _measured(solid, points, centers, radii)
+
+
+def _seated(solid: Volume, centers: Array, radii: Array) -> tuple[Array, Array]:
+    """Return spheres that lie within a solid, to its tolerance, and touch its flat faces where they are near them.
+
+    Those at edges and corners are moved, the others are resized: on a grid, spheres protrude by up to its pitch, most
+    of them in the middle of a face, where a body would rock on them.
+    """
+    small = radii <= 1.2 * _SMALLEST_RADIUS * solid.size()
+    beside = _faces_beside(solid, centers, radii)
+    normals, offsets = solid.faces.planes[:, :3], solid.faces.planes[:, 3]
+    centers = centers.copy()
+    for _ in range(_SWEEPS):
+        for k, (normal, offset) in enumerate(zip(normals, offsets, strict=True)):
+            above = centers @ normal - offset + radii
+            moved = small & beside[:, k] & (above > 0) & (above < 2 * radii)
+            centers[moved] -= above[moved, None] * normal
+    heights = centers @ normals.T - offsets
+    room = np.where(beside & (heights < 0), -heights, np.inf).min(1, initial=np.inf)
+    depth = np.minimum(solid.depth(centers) + solid.tolerance, room)
+    touching = np.abs(room - radii) < _SEATED_PITCHES * solid.pitch
+    return centers, np.where(small, radii, np.where(touching, depth, np.minimum(radii, depth)))
+
+
+def _faces_beside(solid: Volume, centers: Array, radii: Array) -> NDArray[np.bool_]:
+    """Return which flat faces spheres may touch, shape (n, F)."""
+    count = len(solid.faces.planes)
+    points = [solid.surface[solid.faces.of_point == k] for k in range(count)]
+    near = [KDTree(one).query(centers)[0] < radii + 2 * solid.pitch for one in points if len(one)]
+    found = np.zeros((len(centers), count), bool)
+    found[:, [k for k in range(count) if len(points[k])]] = np.stack(near, 1) if near else False
+    return found
 
 
 def _measured(solid: Solid, points: Array, centers: Array, radii: Array) -> CollisionSpheres:

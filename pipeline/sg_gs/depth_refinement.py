@@ -78,10 +78,10 @@ def refine(solid: Volume, views: Sequence[View], body: int, seed: int) -> tuple[
 def _pass(solid: Volume, views: Sequence[View], body: int, seed: int) -> tuple[Volume, Refinement]:
     rng = np.random.default_rng(seed)
     index = rng.permutation(solid.surface.shape[0])[:_POINTS]
-    points, normals = solid.surface[index], _smooth_normals(solid, index)
+    points, normals = solid.surface[index], smooth_normals(solid, index)
     size = solid.size()
     offsets = np.linspace(-_DEEPEST * size, _OUTWARD * size, _OFFSETS)
-    scores, pairs = _agreement(solid, points, normals, offsets, views, body)
+    scores, pairs = agreement(solid, points, normals, offsets, views, body)
     near: Array = np.asarray(KDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))[1])
     alike = np.einsum("id,ijd->ij", normals, normals[near]) > 0.85
     weight = alike * pairs[near]
@@ -108,7 +108,7 @@ def _outlined(points: Array, views: Sequence[View], body: int) -> Array:
     return count
 
 
-def _smooth_normals(solid: Volume, index: Array) -> Array:
+def smooth_normals(solid: Volume, index: Array) -> Array:
     """Return normals averaged over a neighbourhood of two pitches, because those of the hull are rough."""
     _, near = KDTree(solid.surface).query(solid.surface[index], k=12)
     normals = solid.normals[near]
@@ -117,7 +117,7 @@ def _smooth_normals(solid: Volume, index: Array) -> Array:
     return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
 
 
-def _agreement(
+def agreement(
     solid: Volume, points: Array, normals: Array, offsets: Array, views: Sequence[View], body: int
 ) -> tuple[Array, Array]:
     """Return the mean pairwise correlation of patches by point and offset, (n, K), and the number of pairs (n,)."""
@@ -127,7 +127,7 @@ def _agreement(
     np.put_along_axis(chosen, ranked, True, axis=1)
     chosen &= cosine > _LEAST_COSINE
     spacing = np.median(footprint[chosen]) if chosen.any() else solid.pitch
-    tangent, other = _tangents(normals)
+    tangent, other = tangents(normals)
     steps = spacing * (np.arange(_PATCH) - _PATCH // 2)
     a, b = (grid.reshape(-1) for grid in np.meshgrid(steps, steps, indexing="ij"))
     patch = tangent[:, None] * a[:, None] + other[:, None] * b[:, None]
@@ -162,7 +162,7 @@ def _visibility(solid: Volume, points: Array, normals: Array, views: Sequence[Vi
         footprint[:, number] = distance / view.camera.K[0, 0]
         front = np.flatnonzero(facing > _LEAST_COSINE)
         path = points[front, None] + steps[:, None] * toward[front, None]
-        free = solid.at(path.reshape(-1, 3)).reshape(len(front), -1).min(1) > -2 * solid.pitch
+        free = solid.at(path.reshape(-1, 3)).reshape(len(front), len(steps)).min(1) > -2 * solid.pitch
         pixel, depth = view.camera.project(points[front])
         column, row = (np.floor(np.nan_to_num(pixel[:, k], nan=-1)).astype(int) for k in range(2))
         inside = (
@@ -224,7 +224,8 @@ def _smoothed(shift: Array, confidence: Array, near: Array, alike: Array) -> Arr
     return result
 
 
-def _tangents(normals: Array) -> tuple[Array, Array]:
+def tangents(normals: Array) -> tuple[Array, Array]:
+    """Return two unit vectors (n, 3) orthogonal to unit normals (n, 3) and to each other."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(normals, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
