@@ -89,8 +89,9 @@ class PhysConfig(FileModel):
     warmup_s: Duration = 0.1
     image_size: Annotated[int, Field(ge=32, le=16384)] = 320
     """Video frames are reduced to this longer side [px] for fitting."""
-    geometry: bool = True
-    """Whether the colliding spheres that touch are refined with the images, through the motion alone."""
+    geometry: bool | None = None
+    """Whether the colliding spheres that touch are refined with the images, through the motion alone; left out, only
+    under the paper's law, whose published form it is."""
     contact_law: Literal["closed_form", "paper"] = "closed_form"
     """Law of contact that is fitted: ours, or the ContactGaussian-WM paper's, which the torch engine alone has."""
     effects: tuple[str, ...] = ()

@@ -47,9 +47,7 @@ class TruePart:
             CgwmError: As `cgwm fit` has them.
         """
         supervise = "tracks" if self.part == "poses" else "images"
-        config = PhysConfig.model_validate(
-            {"supervise": supervise, "seed": cell.seed, "device": cell.device, "geometry": self.part != "shape"}
-        )
+        config = PhysConfig.model_validate({"supervise": supervise, "seed": cell.seed, "device": cell.device})
         with tempfile.TemporaryDirectory() as folder:
             parent, capture, out = (Path(folder) / name for name in ("parent", "capture", "model"))
             write_model(parent, self._parent(cell))

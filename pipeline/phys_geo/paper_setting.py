@@ -16,7 +16,8 @@ _PARTS = ("mass_distribution", "length_scale")
 def paper_config(file: ModelFile, capture: Capture, config: PhysConfig) -> PhysConfig:
     """Return the settings of a fit of the paper's law, and say what it costs.
 
-    Mass distribution and scale are not chosen by windows about impacts, which assume our law.
+    Mass distribution and scale are not chosen by windows about impacts, which assume our law; contact spheres are
+    refined as published, unless the setting `geometry` says no.
 
     Args:
         file: The model from which the fit starts.
@@ -42,4 +43,5 @@ def paper_config(file: ModelFile, capture: Capture, config: PhysConfig) -> PhysC
     note(
         f"phys-geo: the contact law 'paper' runs in the torch engine alone, some {SLOWER} times slower than the kernels"
     )
-    return config.model_copy(update=dict.fromkeys(_PARTS, False))
+    refined = config.geometry is not False
+    return config.model_copy(update={**dict.fromkeys(_PARTS, False), "geometry": refined})

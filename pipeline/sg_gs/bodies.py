@@ -68,7 +68,8 @@ def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres 
         T_world_body[:3, 3] = world.means.double().mean(0).cpu().numpy()
     T_body_world = np.linalg.inv(T_world_body)
     note(f"{body.name}: colliding spheres")
-    collision, distance, mass_properties = _contact_properties(stage, body, solid, T_body_world)
+    felt = _felt(stage, index, body, solid)
+    collision, distance, mass_properties = _contact_properties(stage, body, felt, T_body_world)
     visual = None
     if world is not None and solid is not None:
         visual = world.moved(_tensor(T_body_world, stage.device)).to_numpy()
@@ -128,17 +129,23 @@ def _contact_properties(
 def _hull(stage: Stage, index: int, body: Body) -> Volume:
     silhouettes = [view.silhouette(index) for view in stage.train]
     solid = carve([one for one in silhouettes if one is not None], stage.ground, body.name)
-    views, seed = [view for view in stage.train if view.labels is not None], stage.config.seed
-    record: dict[str, Any] = {}
-    if all(view.depth_map is None for view in stage.train):  # else the maps have carved it already
-        solid, refinement = refine(solid, views, index, seed)
-        record["refinement"] = asdict(refinement)
-    if stage.config.flat_faces:
-        note(f"{body.name}: flat faces")
-        solid, faces = flatten_faces(solid, views, index, seed)
-        record["flat_faces"] = asdict(faces)
-    stage.record[body.name] = record
+    if any(view.depth_map is not None for view in stage.train):
+        return solid  # The depth maps have carved it already, so the photos need not be compared.
+    views = [view for view in stage.train if view.labels is not None]
+    solid, refinement = refine(solid, views, index, stage.config.seed)
+    stage.record[body.name] = {"refinement": asdict(refinement)}
     return solid
+
+
+def _felt(stage: Stage, index: int, body: Body, solid: Volume | None) -> Volume | None:
+    """Return what collides of a solid from photos: with flat faces where the photos show them."""
+    if solid is None or body.shape is not None or not stage.config.flat_faces:
+        return solid
+    note(f"{body.name}: flat faces")
+    views = [view for view in stage.train if view.labels is not None]
+    felt, faces = flatten_faces(solid, views, index, stage.config.seed)
+    stage.record[body.name]["flat_faces"] = asdict(faces)
+    return felt
 
 
 def _fit_spheres(stage: Stage, index: int, body: Body, solid: Volume) -> Spheres:
