@@ -10,7 +10,15 @@ and orientations are measured, in angles over the slow error about an axis. Look
 
 the ratio of a capture is that of its second strongest training episode, of the strongest where fewer than three are
 looked at. No draw is discarded: where a ratio cannot be
-reached (a friction cannot be negative), the effect has its largest size and the truth the ratio that it reached.
+reached (a friction cannot be negative), the effect has its largest or smallest size and the truth the ratio that it
+reached.
+
+Sizes of effects of contact are bounded by what surfaces do. Below: friction of one pair of surfaces differs by 5 % and
+more from day to day and place to place (measured pushes of one plate on one board: 0.289 to 0.326, docs/real-data.md),
+so that an effect of less, a tenth of a usual large one, is none. Above: friction at rest exceeds sliding friction by at
+most 0.3 in tables of dry pairs; restitution falls with speed as v^-1/4 (Johnson, Contact Mechanics, 11.5), at 3 m/s to
+three quarters of its value at 1 m/s; a face of 10 cm with friction 0.5 brakes its spin by 0.02 m times its load; and a
+body that a surface holds by more than its weight sticks to it.
 """
 
 from __future__ import annotations
@@ -30,7 +38,10 @@ from .errors import Errors, between
 LEAST_RATIO, MOST_RATIO = 3.0, 100.0
 MOST_SIZE = {"anisotropic_friction": 1.0, "inertia_shape": 1.8, "friction_patch": 1.3, "com_offset": 2.0}
 MOST_SIZE |= {"marker_offset": 1.5}
+MOST_SIZE |= {"stribeck_friction": 1.2, "velocity_restitution": 1.0, "torsional_friction": 1.3, "adhesion": 1.0}
 """The largest size, in usual large ones; 3 for all others."""
+LEAST_SIZE, LEAST_CONTACT = 1e-3, 0.1
+"""The smallest size, in usual large ones, and that of effects of contact."""
 _LOOKED_AT = 4
 _STEPS = 4
 _CLOSE = 0.1
@@ -77,7 +88,7 @@ def sized_effect(name: str, bench: Bench, seed: Sequence[int]) -> Sized:
     entry = EFFECTS[name]
     wanted = between(np.random.default_rng([*seed, 1]), LEAST_RATIO, MOST_RATIO)
     large = entry.large[bench.thing.kind]
-    most = MOST_SIZE.get(name, 3.0) * large
+    least, most = (LEAST_CONTACT if entry.acts == "contact" else LEAST_SIZE) * large, MOST_SIZE.get(name, 3.0) * large
 
     def drawn(size: float) -> Hidden:
         return entry.draw(bench.thing, size, np.random.default_rng([*seed, 2]))
@@ -90,9 +101,9 @@ def sized_effect(name: str, bench: Bench, seed: Sequence[int]) -> Sized:
         ratio = _ratio(drawn(size), bench, looked_at, plain, windows)
         off = abs(np.log(max(ratio, 1e-9) / wanted))
         best = min(best, (off, size, ratio))
-        if off < _CLOSE or (size >= most and ratio <= wanted):
+        if off < _CLOSE or (size >= most and ratio <= wanted) or (size <= least and ratio >= wanted):
             break
-        size = float(np.clip(size * wanted / max(ratio, 1e-3 * wanted), 1e-3 * large, most))
+        size = float(np.clip(size * wanted / max(ratio, 1e-3 * wanted), least, most))
     _, size, ratio = best
     return Sized(drawn(size), size, wanted, ratio)
 
