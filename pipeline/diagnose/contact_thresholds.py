@@ -201,7 +201,8 @@ class SegmentsThresholds:
     alone_score: float = threshold(
         120.0,
         "chi2",
-        "score where there are no sliding segments that could confirm the effect",
+        "score where there are no sliding segments that could confirm the effect, and of an effect of flight near the "
+        "ground where flights do not fit",
         "friction by direction has reached 113 where there was none",
     )
     in_impacts_alone: tuple[str, ...] = threshold(("velocity_restitution",), "effects", "what sliding cannot show")

@@ -22,7 +22,7 @@ from ..segments.linearization import Linearization
 from ..segments.segment_fit import Refit, refit
 from ..segments.segments import Segments
 from ..trajectories.innovations import WHITE
-from .evidence import Evidence
+from .evidence import Evidence, prior_odds
 from .falsification import Repetition, repetition
 from .score_test import ScoreTest, canonical_correlation, gain_by_episode, score_test
 from .session_scales import linearize_beside_scales
@@ -230,9 +230,10 @@ def refitted(
     known = {p.name: rest[k] for k, p in enumerate(before.parameters)}
     initial = torch.stack([*(known[p.name] for p in others), *values.to(torch.float64)])
     after = refit(parts, added, [*others, *own], initial)
-    bic = (after.cost - before.cost) / dispersion + len(own) * math.log(count)
     found = {p.name.partition(".")[2]: after.number(p.name) for p in own}
     numbers = {name: (value, std * math.sqrt(dispersion)) for name, (value, std) in found.items()}
+    bic = (after.cost - before.cost) / dispersion + len(own) * math.log(count)
+    bic += prior_odds(effect, {name: value for name, (value, _) in numbers.items()})
     return replace(evidence, refitted=after, delta_bic=bic, numbers=numbers)
 
 

@@ -8,10 +8,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..physics.effects.effect import Effect, EffectParameter
 from ..segments.candidates import Candidate
 from ..segments.segment_fit import Refit
 from .falsification import Repetition
 from .score_test import ScoreTest
+from .thresholds import THRESHOLDS
+
+
+def implausible(effect: Effect, values: Mapping[str, float]) -> list[EffectParameter]:
+    """Return the parameters whose values are larger than instruments or nature usually have them."""
+    return [p for p in effect.parameters if abs(values.get(p.name, 0.0)) > p.plausible]
+
+
+def prior_odds(effect: Effect, values: Mapping[str, float]) -> float:
+    """Return what chi2 has to fall by for an effect of such values, in addition to that of a plausible one."""
+    return THRESHOLDS.flight.implausible * len(implausible(effect, values))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +68,11 @@ class Evidence:
     def estimates(self) -> dict[str, tuple[float, float]]:
         """Estimate and standard error by parameter; empty where only the score test was made."""
         return self.numbers or {}
+
+    @property
+    def odds(self) -> float:
+        """What its estimates are worth before the data, in chi2: 0, or more where they are implausibly large."""
+        return prior_odds(self.candidate.effect, {name: value for name, (value, _) in self.estimates.items()})
 
     @property
     def size(self) -> float:

@@ -229,8 +229,8 @@ def _gains_near(
 
 
 def _bic(evidence: Evidence, linear: Linearization) -> float:
-    """Return the penalty of BIC."""
-    return len(evidence.candidate.effect.parameters) * math.log(max(linear.dof.sum(), 2.0))
+    """Return the penalty of BIC, and of implausible sizes."""
+    return len(evidence.candidate.effect.parameters) * math.log(max(linear.dof.sum(), 2.0)) + evidence.odds
 
 
 def _replaced(world: World, old: Evidence, new: Evidence) -> World:

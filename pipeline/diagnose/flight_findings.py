@@ -96,6 +96,11 @@ class FlightFindings:
         return self.left is not None and self.left.p_value < LIMITS.repeated_p
 
     @property
+    def left_constant(self) -> bool:
+        """Whether what repeats beside the selected effects is a constant force in world axes."""
+        return self.left is not None and self.left.coordinate == "constant" and self.left.frame == "world"
+
+    @property
     def predicts(self) -> bool:
         """Whether each selected effect repeats from episode to episode; False without any."""
         chosen = [step for step in self.steps if step.flagged]
@@ -115,7 +120,9 @@ class FlightFindings:
         explain nearly all that the model lacks.
         """
         inconsistent = self.agreement is not None and self.agreement.doubtful
-        imitated = self.repeats and self.common_share < LIMITS.common_share
+        # what is left is known where it is a constant force: a candidate, and no other law that the effects imitate
+        least = LIMITS.constant_share if self.left_constant else LIMITS.common_share
+        imitated = self.repeats and self.common_share < least
         most = bool(self.in_flight) and self.explained_share >= LIMITS.enough_share
         follows = self.own_law is not None and not most
         other = bool(self.fleeting) or any(one.better for one in self.others)

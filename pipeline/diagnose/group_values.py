@@ -27,7 +27,7 @@ from ..segments.segment_fit import refit
 from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
 from .effect_selection import SelectionStep
-from .evidence import Evidence
+from .evidence import Evidence, prior_odds
 from .score_test import ScoreTest, canonical_correlation, solved
 from .thresholds import THRESHOLDS
 
@@ -56,7 +56,7 @@ class _Fitted:
     values: dict[int, Array]
     """Parameters (k,) by group."""
     cost: float
-    """Chi2 of all flights, in units of the scatter, with BIC's penalty for its parameters."""
+    """Chi2 of all flights, in units of the scatter, with BIC's penalty for its parameters and for implausible ones."""
     alone: float
     """The same with one value for all groups."""
     by_flight: Array
@@ -235,13 +235,15 @@ def _fitted(search: _Search, place: _Place, candidate: Candidate, start: dict[in
     """Return an effect refitted to the flights of each group, and to all of them."""
     values, by_flight, alone = _refitted(candidate, place.world, place.flight, search.groups, start)
     beside, own = search.penalty * place.beside, search.penalty * len(candidate.effect.parameters)
+    names = [p.name for p in candidate.effect.parameters]
+    odds = sum(prior_odds(candidate.effect, dict(zip(names, v.tolist(), strict=True))) for v in values.values())
     return _Fitted(
         candidate=candidate,
         replaces=place.replaces,
         world=place.world,
         flight=place.flight,
         values=values,
-        cost=float(by_flight.sum()) / search.scatter + beside + own * len(values),
+        cost=float(by_flight.sum()) / search.scatter + beside + own * len(values) + odds,
         by_flight=by_flight,
         alone=alone / search.scatter + beside + own,
     )

@@ -7,13 +7,14 @@ with the states of whole flights free: windows of a tenth of a second would show
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..optimization.uncertainty import chi2_tail
+from ..optimization.uncertainty import student_tail
 from ..physics.world import World
 from ..segments.candidates import base_parameters, base_values, without_effect
 from ..segments.segment_fit import projected
@@ -41,20 +42,34 @@ def without_lasting(flight: Segments, world: World, names: Sequence[str], disper
 
 
 def _changes(flight: Segments, name: str, dispersion: float) -> bool:
-    """Return whether an effect of the flights' world is not as large late as it is early."""
+    """Return whether an effect of the flights' world is not as large late as it is early.
+
+    No model of slow errors is exact: the difference is weighed against its scatter between episodes (Huber's sandwich,
+    with Student's t), at least against the noise.
+    """
     parameters = base_parameters(flight.world, "flight")
     rows, jacobian = flight.residuals(parameters, base_values(flight.world, parameters))
     others = [k for k, p in enumerate(parameters) if p.name.partition(".")[0] != name]
     columns = flight.innovations(_fading_and_growing(flight, name))
     joined = torch.cat((jacobian[..., others], columns, jacobian[..., len(parameters) :]), -1)
     linear = projected(flight, rows, joined, len(others) + 2)
-    information, score = linear.information.sum(0).numpy(), linear.score.sum(0).numpy()
+    information, score = linear.information.numpy(), linear.score.numpy()
     weak = np.diag([1 / p.prior[1] ** 2 for k, p in enumerate(parameters) if k in others] + [1e-6] * 2)
-    covariance = np.linalg.inv(information + weak)
-    early, late = 1 + (covariance @ score)[-2:]
-    variance = float(np.array([1.0, -1.0]) @ covariance[-2:, -2:] @ np.array([1.0, -1.0])) * dispersion
+    covariance = np.linalg.inv(information.sum(0) + weak)
+    step = covariance @ score.sum(0)
+    early, late = 1 + step[-2:]
+    apart = covariance[-2] - covariance[-1]
+    own = (score - information @ step) @ apart
+    episode = np.array([item.episode for item in flight.items])
+    units = [own[episode == one].sum() for one in np.unique(episode)]
+    variance = max(float(apart[-2] - apart[-1]) * dispersion, _between(units))
     unlike = min(early, late) < LIMITS.lasting_ratio * max(early, late)
-    return unlike and chi2_tail((early - late) ** 2 / variance, 1) < LIMITS.lasting_p
+    return unlike and 2 * student_tail(abs(early - late) / math.sqrt(variance), len(units) - 1) < LIMITS.lasting_p
+
+
+def _between(units: Sequence[float]) -> float:
+    """Return the variance of a sum of what independent episodes contribute; infinite for fewer than two."""
+    return float(np.square(units).sum()) * len(units) / (len(units) - 1) if len(units) > 1 else math.inf
 
 
 def _fading_and_growing(flight: Segments, name: str) -> Tensor:

@@ -58,8 +58,9 @@ from .pictures import pictures_of
 from .remaining import held_out_of, remaining_of
 from .sparse_regression import residual_law
 from .thresholds import THRESHOLDS
+from .unlike_episodes import unlike_episodes, unlike_warnings
 from .verdict import Findings, find
-from .wording import law_warnings, motion_warnings, sentence, unseen_motion
+from .wording import law_warnings, motion_warnings, sentence, size_warnings, unseen_motion
 
 JOINTED = (
     "of the jointed body '{name}' the motion of the centre of mass of its links was examined, in flight alone: what "
@@ -164,7 +165,11 @@ def prepared_world(
     spans = durations(found.episodes)
     with within_budget([segment_part("the tests of all effects", world, spans)], _LESS, doubt=motion_doubt(spans)):
         prepared = prepare(world, found.episodes, found.noise, _groups(capture, names))
-    prepared = replace(prepared, warnings=(*found.warnings, *prepared.warnings))
+        unlike = {} if world.chains else unlike_episodes(prepared)
+        if unlike:
+            kept = [episode for episode in found.episodes if episode[0] not in unlike]
+            prepared = prepare(world, kept, found.noise, _groups(capture, [name for name, _ in kept]))
+    prepared = replace(prepared, warnings=(*found.warnings, *unlike_warnings(unlike), *prepared.warnings))
     check_observability(world, prepared, str(capture.root))
     return world, prepared
 
@@ -199,7 +204,7 @@ def report_and_findings(
     _, refused = admissible(world, library, prepared.has_orientation, prepared.observations.spin_rad_s is not None)
     clear = prepared.airborne & (prepared.observations.seen.amax(-1) > 0)
     seen = int((prepared.observations.seen.amax(-1) > 0).sum())
-    warnings = [*prepared.warnings, *motion_warnings(prepared), *law_warnings(findings)]
+    warnings = [*prepared.warnings, *motion_warnings(prepared), *law_warnings(findings), *size_warnings(findings)]
     law = _law(findings.flight.prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []

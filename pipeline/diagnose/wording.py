@@ -5,6 +5,7 @@ from __future__ import annotations
 from ...schemas import ResidualLaw
 from ..report.page import listed
 from ..segments.prepare import Prepared
+from .evidence import implausible
 from .law_export import further_terms
 from .own_accelerations import UPWARD
 from .verdict import Findings
@@ -130,6 +131,20 @@ def motion_warnings(prepared: Prepared) -> list[str]:
     if prepared.flight is None:
         return ["the tracks contain no usable flight: effects that act in flight cannot be tested."]
     return []
+
+
+def size_warnings(findings: Findings) -> list[str]:
+    """Return a warning for each selected effect that is larger than instruments or nature usually have it."""
+    found = []
+    for one in (chosen.evidence for chosen in findings.chosen):
+        effect, values = one.candidate.effect, {name: value for name, (value, _) in one.estimates.items()}
+        for p in implausible(effect, values):
+            unit = "" if p.unit == "1" else f" {p.unit}"
+            found.append(
+                f"{one.candidate.spec}: {p.name} = {values[p.name]:.2g}{unit}, and more than {p.plausible:g}{unit} is "
+                "rare. Check what was given (frame rate, units, lengths), or look for a force that does the same."
+            )
+    return found
 
 
 def law_warnings(findings: Findings) -> list[str]:

@@ -97,6 +97,7 @@ class _Predicted:
         touched = self._touched_in_tracks()
         passing = touched & ~self._touches_in_model()
         never = bool(touched.any()) and float(passing.sum() / touched.sum()) >= LIMITS.episodes_worse
+        never &= float(touched.double().mean()) >= LIMITS.touched_share  # one episode may be a wrong measurement
         if not worse and not never:
             return None
         error = float(ours.mean())
@@ -190,7 +191,7 @@ def _sentence(error_m: float, other_m: float, worse_than: str | None, touched: i
     """
     parts = []
     if touched:
-        parts.append(f"nothing touches anything in it, while the tracks show contact in {touched} episodes")
+        parts.append(f"nothing touches anything in it, while the tracks show contact in {touched} of the episodes")
     if worse_than is not None:
         body = "stands still" if worse_than == "still" else "keeps its velocity"
         ours = f"it is {error_m:.2g} m off" if np.isfinite(error_m) else "its rollout diverges"

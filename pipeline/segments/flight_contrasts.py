@@ -39,6 +39,12 @@ class FlightContrasts:
     axes: Tensor
     """Measured axes, shape (B, 3)."""
 
+    @property
+    def count(self) -> float:
+        """Number of measured values beside what states and common effects take."""
+        measured = float((self.mask.sum(1) * self.axes.sum(1)).sum())
+        return measured - self.own.shape[0] * self.own.shape[-1] - self.common.shape[-1]
+
     @staticmethod
     def of(
         segments: Segments, rows: Tensor, jacobian: Tensor, count: int, kind: int, spacing_s: float = 0.0

@@ -325,12 +325,15 @@ def _model_correlated_noise(state: _State) -> None:
 
 
 def _smeared(whole: Observations, contact: Tensor, noise_model: NoiseModel) -> Tensor:
-    """Return the frames (E, T) into which a filter smears contacts: it reaches as far as it correlates errors."""
+    """Return the frames (E, T) into which a filter smears contacts: it reaches as far as it correlates errors.
+
+    A filter lets no white noise pass: errors of which a part is white were not made by one, however long others last.
+    """
     seen = whole.seen.amax(-1) > 0
     step_s = float(
         np.median(np.concatenate([_steps(times, known) for times, known in zip(whole.times_s, seen, strict=True)]))
     )
-    memory_s = max(noise.time_s for noise in noise_model if noise.share)
+    memory_s = max((noise.time_s for noise in noise_model if noise.share > LIMITS.filtered), default=0.0)
     reach_s = min(LIMITS.smeared_times * memory_s, LIMITS.smeared_s)
     reach = max(LIMITS.smeared_frames, math.ceil(reach_s / step_s))
     near = torch.nn.functional.max_pool1d((contact & seen).double()[:, None], 2 * reach + 1, 1, reach)

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 from ..optimization.uncertainty import student_tail
 from .residual_wrench import ResidualWrenches
+from .thresholds import SEGMENT_THRESHOLDS
+
+LIMITS = SEGMENT_THRESHOLDS.slow_errors
 
 Array = NDArray[np.float64]
 
@@ -56,7 +59,10 @@ class RepeatedForce:
 
 
 def repeated_force(found: ResidualWrenches) -> RepeatedForce | None:
-    """Return the law that predicts held-out episodes best; None for fewer than three episodes."""
+    """Return the law that predicts held-out episodes best; None for fewer than three episodes.
+
+    A constant force is the simplest one, and stands where none is better beyond chance.
+    """
     episodes = np.array([item.episode for item in found.segments])
     if len(np.unique(episodes)) < 3:
         return None
@@ -70,7 +76,17 @@ def repeated_force(found: ResidualWrenches) -> RepeatedForce | None:
                 gains = _held_out(groups, episodes, score, information)
                 laws.append(RepeatedForce(coordinate=coordinate, frame=frame, gains=gains))
     best = max(laws, key=lambda law: law.gain)
+    constant = laws[0]
+    if not _is_better(best, constant):
+        best = constant
     return RepeatedForce(coordinate=best.coordinate, frame=best.frame, gains=best.gains, tried=len(laws))
+
+
+def _is_better(law: RepeatedForce, other: RepeatedForce) -> bool:
+    """Return whether a law predicts held-out episodes better than another one beyond chance: a paired t-test."""
+    more = np.subtract(law.gains, other.gains)
+    error = float(np.std(more, ddof=1)) / math.sqrt(len(more))
+    return student_tail(float(more.mean()) / max(error, 1e-12), len(more) - 1) < LIMITS.better_law
 
 
 def _held_out(

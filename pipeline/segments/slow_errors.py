@@ -33,7 +33,7 @@ from .prepare import Prepared, whole_flights
 from .segment_states import fit_states
 from .segments import Segments
 from .thresholds import SEGMENT_THRESHOLDS
-from .variance_components import FAST_S, variance_components
+from .variance_components import FAST_S, FASTEST_S, variance_components
 
 LIMITS = SEGMENT_THRESHOLDS.slow_errors
 
@@ -45,7 +45,7 @@ LEAST_COUNT = 12
 """Fewest residuals of a flight, beside what states and effects take, that tell whether it is one."""
 SPACING, FINER, THINNED = 0.5, 0.7, 3
 """Times between frames, in correlation times; share of it below which the estimate is made again, at most so often."""
-SHORTEST = 12
+SHORTEST = 8
 """Minimum number of frames of a flight."""
 COMMON_S = 0.1
 """Length [s] of the intervals in each of which one force may act in all episodes alike."""
@@ -156,14 +156,15 @@ def _parts(
     """Return what `variance_components` does of positions (kind 0) or rotations (1); None without enough frames.
 
     Of frames much closer than errors last, nearly all contrasts are faster than what a filter lets pass, and their law
-    is none of the processes'. So the frames are thinned out, again where the errors turn out to be faster.
+    is none of the processes'. So the frames are thinned out, again where the errors turn out to be faster, but not so
+    far that short flights show nothing.
     """
     parts, spacing_s = None, SPACING * min(known.time_s, FAST_S) if known.share else 0.0
     for _ in range(THINNED if spacing_s else 1):
         contrasts = FlightContrasts.of(flights, *linear, count, kind, spacing_s)
-        if contrasts is None and spacing_s:
-            spacing_s = 0.0
-            continue
+        while spacing_s and (contrasts is None or contrasts.count < LIMITS.least_frames):
+            spacing_s = spacing_s / 2 if spacing_s > FASTEST_S else 0.0
+            contrasts = FlightContrasts.of(flights, *linear, count, kind, spacing_s)
         if contrasts is None:
             return parts
         parts = variance_components(contrasts, known, level)

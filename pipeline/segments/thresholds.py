@@ -119,6 +119,12 @@ class PreparationThresholds:
         "by argument: a filter smears a contact as far as it correlates errors",
     )
     smeared_s: float = threshold(0.04, "s", "longest such time: slower errors come from no filter", BY_ARGUMENT)
+    filtered: float = threshold(
+        0.95,
+        "1",
+        "share of the variance of errors that is correlated, above which a filter made them: it passes no white noise",
+        "by argument; measured tosses of a cube have 0.9, and sharp contacts",
+    )
     bad_fit: float = threshold(1.3, "1", "chi2 of a contact segment, in usual ones, from which it is fitted again")
     unobservable_share: float = threshold(
         0.8, "widths of the prior", "standard error from which a parameter is called not observable"
@@ -265,6 +271,9 @@ class DescribedThresholds:
     sizes_worse: float = threshold(0.1, "sizes", "tolerance of `times_worse` in addition", BY_ARGUMENT)
     episodes_worse: float = threshold(0.75, "1", "share of the episodes in which it has to be so", BY_ARGUMENT)
     touch_m: float = threshold(1e-4, "m", "change of the predicted motion by contact that is one", BY_ARGUMENT)
+    touched_share: float = threshold(
+        0.25, "1", "share of the episodes with contact of which a model without any says nothing", BY_ARGUMENT
+    )
     level_s: float = threshold(0.2, "s", "time at one height that shows a support", BY_ARGUMENT)
     level_share: float = threshold(
         0.3, "1", "change of height that is none, as a share of that of free fall about its highest point", BY_ARGUMENT
@@ -295,7 +304,20 @@ class SlowErrorThresholds:
     least_episodes: int = threshold(
         3, "episodes", "fewest that tell what differs between them from what is common", BY_ARGUMENT
     )
-    least_frames: int = threshold(60, "frames", "fewest of all flights, as for the size of the noise", BY_ARGUMENT)
+    least_frames: int = threshold(
+        60,
+        "frames",
+        "fewest of all flights, as for the size of the noise; and fewest values beside states and common effects, for "
+        "which frames are thinned out less",
+        "by argument; 20 measured tosses of a cube were left with 13 values, and their tilts with no evidence",
+    )
+    better_law: float = threshold(
+        0.05,
+        "probability",
+        "what repeats from episode to episode is a constant force unless another law predicts held-out episodes better "
+        "by a paired t-test with a p-value below it",
+        BY_ARGUMENT,
+    )
     unsound: float = threshold(
         6.0,
         "1",

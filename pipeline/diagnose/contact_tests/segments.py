@@ -75,6 +75,8 @@ class SegmentsTest(ContactTest):
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bar, which is higher for an effect that sliding segments would show; none if they contradict."""
         best, sliding = equals[0], data.earlier.get("sliding", ())
+        if best.candidate.effect.phase != "contact" and not data.explained:  # flights, which show it too, do not fit
+            return (Bar(score=self.limits.alone_score, gain_t=self.limits.gain_t),)
         if best.candidate.effect.phase != "contact" or best.name in self.limits.in_impacts_alone:
             return (Bar(score=self.limits.score, gain_t=self.limits.gain_t),)
         if not sliding:

@@ -45,6 +45,9 @@ class EffectParameter:
     """Whether the value cannot be negative."""
     shared: Literal["all", "group", "episode"] = "all"
     """Whether one value serves all episodes, each group of episodes, or each episode."""
+    plausible: float = math.inf
+    """Largest magnitude that instruments or nature usually have, in its unit; infinite where any size occurs. A larger
+    one may be a mistake, such as a wrong frame rate, and has to explain the data better than a force by its odds."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from cgwm.pipeline.diagnose.verdict import find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects.registry import load_effect
 from cgwm.pipeline.segments.candidates import Candidate
-from cgwm.pipeline.segments.prepare import LIMITS, Prepared, prepare
+from cgwm.pipeline.segments.prepare import LIMITS, Prepared, _smeared, prepare
 from cgwm.pipeline.trajectories.correlated_noise import estimate_noise_model
 from cgwm.pipeline.trajectories.innovations import WHITE, CorrelatedNoise, NoiseModel, innovations  # pyright: ignore[reportMissingImports]
 from helpers.diagnosis_data import NOISE, tosses, world_with
@@ -155,6 +155,16 @@ def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
         # what smoothing lifts above the ground may move the contact by a frame
         assert len(flies & near) <= 2 * max(1, len(contact))
         assert contact.size == 0 or len(flies) < int(sharp.airborne[episode].sum())
+
+
+@pytest.mark.parametrize(("share", "reach"), [(0.99, 4), (0.9, 3)])
+def test_errors_with_a_white_part_come_from_no_filter_which_would_smear_contacts(share: float, reach: int) -> None:
+    sharp, _ = ready("ball", {}, None)
+    contact = torch.zeros_like(sharp.airborne)
+    contact[0, 10] = True
+    errors = NoiseModel(CorrelatedNoise(share, 0.06, order=2.5), CorrelatedNoise())
+    near = torch.nonzero(_smeared(sharp.observations, contact, errors)[0])[:, 0].tolist()
+    assert near == list(range(10 - reach, 10 + reach + 1))
 
 
 def test_smeared_contacts_may_leave_no_flight(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,8 @@ def test_a_ground_that_is_too_low_or_missing_is_the_likely_cause() -> None:
     assert low.sentence.startswith("The model does not describe this motion: nothing touches anything in it")
     none = not_described(world_with("ball", ground=False), episodes, NOISE)
     assert none is not None and none.never_touches and "no ground, and no other body" in none.cause
+    flights = tosses(world_with("ball", ground=False), 5, count=7, duration_s=0.3)
+    assert not_described(world_with("ball", ground=False), [episodes[0], *flights], NOISE) is None
 
 
 def test_a_body_that_falls_between_spheres_of_a_rail_is_told() -> None:

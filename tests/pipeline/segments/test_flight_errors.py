@@ -167,3 +167,10 @@ def test_an_effect_that_moves_nothing_explains_nothing() -> None:
     nothing = 1e-5 * contrasts.rows[..., None]
     assert _spanned(nothing, contrasts.own).shape[-1] == 0
     assert _spanned(1e5 * nothing, contrasts.own).shape[-1] == 1
+
+
+def test_contrasts_count_what_states_and_common_effects_leave() -> None:
+    one = contrasts_of(np.zeros((4, 10, 3)), torch.zeros(4, 10, 3, 5, dtype=F64))
+    assert one.count == 4 * (30 - 6) - 5
+    one.mask[0, 5:] = 0
+    assert one.count == 4 * (30 - 6) - 5 - 15
