@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
+import traceback
+import warnings
+import weakref
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn, TextIO
+
+from fuzz import server
 
 MEMORY = 6 << 30
 """Address space that a command may take beyond what the server has [bytes]."""
@@ -37,25 +41,25 @@ class Runner:
         self.home, self.limit_s = home, limit_s
         for name in ("state", "cache", "log", "user"):
             (home / name).mkdir(parents=True, exist_ok=True)
-        self._server: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> Runner:
-        # An empty entry would mean the working directory, whose folder cgwm/ is not the package.
-        path = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]))
-        threads = {"OMP_NUM_THREADS": "1", "PYTHONSAFEPATH": "1", "PYTHONPATH": path}
-        self._server = subprocess.Popen(
-            [sys.executable, "-m", "fuzz.server"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **threads, **self._environment(self.home)},
-        )
+        asked, self._requests = _pipe()
+        self._answers, answered = _pipe()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of threads: those of xdist only wait
+            self._pid = os.fork()
+        if self._pid == 0:
+            self._requests.close()  # else it would never see that nothing more is asked
+            self._answers.close()
+            self._serve(asked, answered)
+        asked.close()
+        answered.close()
         return self
 
     def __exit__(self, *_: object) -> None:
-        assert self._server is not None and self._server.stdin is not None
-        self._server.stdin.close()
-        self._server.wait()
+        self._requests.close()
+        os.waitpid(self._pid, 0)
+        self._answers.close()
 
     def run(
         self, arguments: list[str], cwd: Path, temporary: Path, limit_s: float | None = None, interrupt: bool = False
@@ -82,6 +86,22 @@ class Runner:
         shutil.rmtree(log)
         return Seen(**answer, **texts, events=events)
 
+    def _serve(self, asked: TextIO, answered: TextIO) -> NoReturn:
+        """Become the server: a fork has what the tests have loaded, and need not load it for seconds again."""
+        try:
+            # What the tests do at their end, such as removing their temporary folders, is not the server's to do.
+            atexit._clear()
+            weakref.finalize._registry.clear()  # pyright: ignore[reportAttributeAccessIssue]
+            weakref.finalize._registered_with_atexit = False  # pyright: ignore[reportAttributeAccessIssue]
+            # An empty entry would mean the working directory, whose folder cgwm/ is not the package.
+            path = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]))
+            os.environ.update(OMP_NUM_THREADS="1", PYTHONSAFEPATH="1", PYTHONPATH=path, **self._environment(self.home))
+            server.serve(asked, answered)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(0)
+
     def _environment(self, temporary: Path) -> dict[str, str]:
         return {
             "HOME": str(self.home / "user"),
@@ -93,13 +113,18 @@ class Runner:
         }
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
-        assert self._server is not None and self._server.stdin is not None and self._server.stdout is not None
-        self._server.stdin.write(json.dumps(request) + "\n")
-        self._server.stdin.flush()
-        line = self._server.stdout.readline()
+        self._requests.write(json.dumps(request) + "\n")
+        self._requests.flush()
+        line = self._answers.readline()
         if not line:
             raise RuntimeError("the warm server has ended")
         return json.loads(line)
+
+
+def _pipe() -> tuple[TextIO, TextIO]:
+    """Return the end of a new pipe that is read, and the one that is written."""
+    read, written = os.pipe()
+    return os.fdopen(read), os.fdopen(written, "w")
 
 
 def _text(path: Path) -> str:

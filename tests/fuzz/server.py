@@ -1,7 +1,7 @@
 """A process that has imported everything and forks once for each command: starting Python and torch takes seconds.
 
-Reads one request a line from stdin, {"arguments", "cwd", "environment", "limit_s", "memory", "log"}, and answers on
-stdout with {"code", "seconds", "timed_out", "peak_mb"}. The command's streams go to files beside the log.
+Reads one request a line, {"arguments", "cwd", "environment", "limit_s", "memory", "log"}, and answers each with
+{"code", "seconds", "timed_out", "peak_mb"}. The command's streams go to files beside the log.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 STARTS = ("subprocess.Popen", "os.exec", "os.posix_spawn", "os.system", "os.spawn", "pty.spawn", "ctypes.dlopen")
@@ -148,17 +148,11 @@ def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
-def main() -> None:
-    """Serve until stdin ends."""
-    requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
+def serve(requests: TextIO, answers: TextIO) -> None:
+    """Run a command for each request until there are no more."""
     load()
     gc.collect()
     gc.freeze()  # so that a child's collections copy no pages of what is loaded
     for line in requests:
         answers.write(json.dumps(_run(json.loads(line))) + "\n")
         answers.flush()
-
-
-if __name__ == "__main__":
-    main()
