@@ -7,15 +7,16 @@ PIP := $(BIN)/python -m pip
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 FILES := $(sort $(shell find cgwm cgwm_cli datasets pipeline schemas -name '*.py' -o -name py.typed -o -name '*.cuh' -o -name '*.js' -o -name '*.css'))
 
+PACKAGE = cgwm cgwm_cli pipeline datasets schemas
 CHECKS = $(BIN)/ruff check && $(BIN)/ruff format --check && $(BIN)/pyright
 
 .PHONY: help install demo test lint same graph docs dist results evidence clean force
 
 help:
 	@echo 'make demo      run the whole pipeline on a scene that it makes itself; the report: $(OUT)/report.html'
-	@echo 'make test      lint, type check and tests, as the continuous integration runs them'
+	@echo 'make test      lint, type check of the package and tests, as the continuous integration runs them'
 	@echo 'make install   only install cgwm into $(VENV)/ (the two above do it by themselves)'
-	@echo 'make lint      ruff and pyright alone'
+	@echo 'make lint      ruff and pyright alone, of the tests too'
 	@echo 'make same      compare what this tree computes with the outputs of the last commit (tools/same.py)'
 	@echo 'make graph     print the import graph of the rooms, and draw it: docs/import-graph.svg'
 	@echo 'make docs      build the documentation as a site that is read offline: build/docs/index.html'
@@ -32,10 +33,11 @@ demo: install
 
 # One thread a worker: the tensors of tests are too small to share out, and the workers share the cores. Bytecode is kept
 # whatever the environment says: without it each process of the tests compiles what it imports, a worker for five seconds.
-# The checks of the text run meanwhile, one after the other; what they print is shown after the tests.
+# The checks of the text run meanwhile, one after the other; what they print is shown after the tests. Types are checked
+# in the package: what the tests call is executed here, and 'make lint' takes half a minute more to check their types.
 test: install
 	@mkdir -p build && rm -f build/lint.log
-	@{ $(CHECKS); } > build/lint.log 2>&1 & checks=$$!; \
+	@{ $(CHECKS) $(PACKAGE); } > build/lint.log 2>&1 & checks=$$!; \
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder; tests=$$?; \
 	wait $$checks; checks=$$?; cat build/lint.log; \
 	[ $$tests = 0 ] || echo 'make test: pytest failed' >&2; [ $$checks = 0 ] || echo 'make test: ruff or pyright failed' >&2; \
@@ -107,9 +109,11 @@ $(VENV)/docs: pyproject.toml constraints.txt | $(VENV)/made
 	@$(PIP) install --quiet -c constraints.txt -r $(VENV)/requirements-docs.txt
 	@touch $@
 
-# Strict editable mode links each file, so that type checkers follow it; new files need to be linked anew.
+# Strict editable mode links each file, so that type checkers follow it; new files need to be linked anew. pip compiles
+# what it installs, but not what it links.
 $(VENV)/linked: $(VENV)/dependencies $(VENV)/files
 	@$(PIP) install -qq --no-deps --no-build-isolation --config-settings editable_mode=strict -e .
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m compileall -q build/__editable__*
 	@touch $@
 
 $(VENV)/files: force | $(VENV)/made
