@@ -267,7 +267,9 @@ def impacts_with_rebound(by_slip: float, by_speed: float) -> Impacts:
     )
 
 
-@pytest.mark.parametrize(("by_slip", "by_speed"), [(0.4, 0.0), (0.0, 0.1), (0.4, 0.1)])
+@pytest.mark.parametrize(
+    ("by_slip", "by_speed"), [(0.4, 0.0), pytest.param(0.0, 0.1, marks=pytest.mark.evidence), (0.4, 0.1)]
+)
 def test_a_rebound_that_falls_with_the_slip_is_no_rebound_that_falls_with_the_speed(
     by_slip: float, by_speed: float
 ) -> None:

@@ -11,21 +11,30 @@ from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.sg_gs import bodies
 from cgwm.pipeline.sg_gs.depth_refinement import Refinement
 from cgwm.pipeline.sg_gs.stage import fit_scene
+from cgwm.pipeline.sg_gs.visual_hull import carve
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import ContactParameters, SynthesizeConfig, UsageError
-from pipeline.sg_gs.test_sg_gs import CONFIG, PLACE, RADIUS, make_capture, quick, write_manifest  # noqa: F401 (a fixture)
+from pipeline.sg_gs.test_sg_gs import CONFIG, PLACE, RADIUS, make_capture, write_manifest
 
 BRIEF = {"iterations": 4, "max_scene_spheres": 100, "bare_ground": False}
 VISUAL = CONFIG.model_copy(update={"collision": "visual", **BRIEF})
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory):
+def quick():
+    """Carve the hull once, as the photos are always the same, and leave it as the silhouettes have it."""
+    hulls = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bodies, "refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))
+        patch.setattr(bodies, "carve", lambda *given: (hulls or hulls.append(carve(*given)) or hulls)[0])
+        yield
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory, quick):
     root = tmp_path_factory.mktemp("visual")
     make_capture(root / "tiny")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bodies, "refine", lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)))  # as `quick` does
-        fit(root / "tiny", root / "model", "sg-gs", splat_config=VISUAL)
+    fit(root / "tiny", root / "model", "sg-gs", splat_config=VISUAL)
     return read_model(root / "model")
 
 
@@ -42,7 +51,7 @@ def test_the_visual_spheres_are_the_colliding_ones(model):
     assert "to_visual" not in record
 
 
-def test_a_distilled_set_is_compared_with_what_is_seen(tmp_path, quick):  # noqa: F811
+def test_a_distilled_set_is_compared_with_what_is_seen(tmp_path, quick):
     result = fit_scene(make_capture(tmp_path / "tiny"), VISUAL.model_copy(update={"collision": "distilled"}))
     ball, record = result.bodies["ball"], result.record["ball"]["collision"]
     assert record["set"] == "distilled"
@@ -69,7 +78,7 @@ def test_without_photos_there_is_nothing_visual_to_collide(tmp_path):
         fit_scene(Capture.open(tmp_path / "tracks_only", check=False), VISUAL)
 
 
-def test_nothing_stands_before_a_body_whose_surroundings_are_unknown(tmp_path, quick):  # noqa: F811
+def test_nothing_stands_before_a_body_whose_surroundings_are_unknown(tmp_path, quick):
     make_capture(tmp_path / "tiny")
     (tmp_path / "tiny" / "capture.toml").write_text('format = "cgwm-capture/1"\n[[bodies]]\nname = "ball"\n')
     result = fit_scene(Capture.open(tmp_path / "tiny", check=False), VISUAL)

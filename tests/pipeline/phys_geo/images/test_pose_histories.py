@@ -43,9 +43,9 @@ def motion(model: Model) -> Rollout:
     return simulate(World.from_model(model), start_state(), torch.arange(FRAMES, dtype=torch.float64) / RATE)
 
 
-def tracked(model: Model) -> tuple[Footage, PoseTrack, Rollout]:
+def tracked(model: Model, cameras: int = 2) -> tuple[Footage, PoseTrack, Rollout]:
     rollout = motion(model)
-    footage = film(model, rollout)
+    footage = Footage.of("000", film(model, rollout).videos[:cameras])
     found = PoseTracker(ImageLoss(coarse_model(model), footage, [0]), ImageLoss(model, footage, [0]), *STILL).run()
     return footage, found, rollout
 
@@ -68,13 +68,15 @@ def test_a_body_that_looks_the_same_turned_about_keeps_one_history_and_the_other
 ) -> None:
     monkeypatch.setattr(pose_tracking, "KEYFRAMES", 2)
     monkeypatch.setattr(pose_tracking, "POLISH_ITERATIONS", 2)
-    footage, found, _ = tracked(two_sided(0.0))
+    footage, found, _ = tracked(two_sided(0.0), cameras=1)
     assert turned_between_frames(found) < 60
     assert 0 <= found.rival_nats < RIVAL_NATS
-    (text,) = track_warnings([VideoEpisode(name="000", footage=footage, loss=None, tracks={}, found=found)])
-    assert text.startswith("000: another history of poses, from another orientation, explains the frames about as well")
     sure = replace(found, rival_nats=math.inf)
-    assert track_warnings([VideoEpisode(name="000", footage=footage, loss=None, tracks={}, found=sure)]) == []
+    episode = VideoEpisode(name="000", footage=footage, loss=None, tracks={}, found=found)
+    others = track_warnings([replace(episode, found=sure)])
+    (text,) = (text for text in track_warnings([episode]) if text not in others)
+    assert text.startswith("000: another history of poses, from another orientation, explains the frames about as well")
+    assert not any("another history" in other for other in others)
     for one in (found, sure):  # as a checkpoint keeps it
         assert stored_track(track_state(one)).rival_nats == one.rival_nats
 

@@ -119,7 +119,7 @@ def test_the_nearer_body_hides_the_other() -> None:
         assert (float(shares[..., 1].sum()) < 1.0) == hidden
 
 
-@pytest.mark.parametrize("cameras", [2, 1])
+@pytest.mark.parametrize("cameras", [pytest.param(2, marks=pytest.mark.evidence), 1])
 def test_poses_are_found_from_masks_alone(tmp_path: Path, cameras: int) -> None:
     """With two cameras to a fraction of a pixel (8 mm); with one, depth is what the size of the outline tells."""
     track, model = thrown(), small_model()
