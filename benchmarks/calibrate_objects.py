@@ -5,7 +5,7 @@ Scanned objects are photographed on a turntable and in hand before black, white 
 model in turn; the best of them, chosen with the truth, is the rival. What cgwm says of its own errors
 (`center_std_percent`) was calibrated on the bottle, and is judged on the other objects. Run with
 
-    python benchmarks/calibrate_objects.py YCB [--objects mustard_bottle,mug] [--seeds 0,1]
+    python benchmarks/calibrate_objects.py YCB [--objects mustard_bottle,mug] [--seeds 0,1] [--workers 4]
 
 where YCB is the folder of the scans, `ycb/ycb` of `ycb.tar.xz`.
 """
@@ -13,6 +13,7 @@ where YCB is the folder of the scans, `ycb/ycb` of `ycb.tar.xz`.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import tempfile
 import time
@@ -37,6 +38,7 @@ LOOKS: tuple[tuple[str, str, float, float, float], ...] = (
     ("white", "turntable", 800.0, -0.1, 0.3),
     ("white", "hand", 620.0, -0.2, 0.0),
     ("clutter", "hand", 620.0, -0.2, 0.0),
+    ("clutter", "turntable", 800.0, -0.1, 0.3),
 )
 """Background, motion, focal length [px], radial distortion and gloss."""
 PHOTOS = 48
@@ -137,6 +139,25 @@ def _said(row: dict[str, Any]) -> bool:
     return any("optical centres" in warning for warning in row["warnings"])
 
 
+def photos_of(ycb: Path, folder: Path, name: str, session: Session) -> tuple[Path, np.ndarray]:
+    """Return the folder of an object's photos, made unless it is there, and the true poses (photo, 4, 4)."""
+    painted = scanned(ycb / name)
+    made = (folder / f"{name}-{session.background}-{session.motion}-{session.seed}").resolve()
+    if not made.is_dir():
+        new = Path(tempfile.mkdtemp(dir=made.parent)) / "photos"
+        write_photos(new, photograph(painted, session)[0])
+        with contextlib.suppress(OSError):  # another process was faster
+            new.rename(made)
+    return made, np.array(poses(session, painted.mesh))
+
+
+def measured(ycb: Path, folder: Path, name: str, session: Session, contender: str) -> dict[str, Any]:
+    """Calibrate one set of photos with cgwm, or with COLMAP and one camera model."""
+    pycolmap.logging.minloglevel = 3
+    made, truth = photos_of(ycb, folder, name, session)
+    return ours(made, truth) if contender == "cgwm" else theirs(made, truth, contender)
+
+
 def main() -> int:
     """Print one JSON line a run, and the counts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -144,34 +165,43 @@ def main() -> int:
     parser.add_argument("--objects", default=",".join(OBJECTS))
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--photos", type=Path, default=Path("out/object-photos"), help="where the photos are kept")
+    parser.add_argument("--contenders", default=",".join(("cgwm", *RIVALS)))
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--results", type=Path, help="file of the results, in out/evidence/ where left out")
     arguments = parser.parse_args()
-    pycolmap.logging.minloglevel = 3
-    store = Store("calibrate_objects", any_commit=True)
-    rows = []
-    for name in arguments.objects.split(","):
-        painted = scanned(arguments.ycb / name)
-        for seed in (int(value) for value in arguments.seeds.split(",")):
-            for session in sessions(seed):
-                key = f"{name} {session.background} {session.motion} {seed}"
-                folder = (arguments.photos / key.replace(" ", "-")).resolve()
-                if not folder.is_dir():
-                    write_photos(folder.with_suffix(".new"), photograph(painted, session)[0])
-                    folder.with_suffix(".new").rename(folder)
-                truth = np.array(poses(session, painted.mesh))
-                mine = store.result(f"{key} cgwm", lambda p=folder, t=truth: ours(p, t))
-                other = {
-                    model: store.result(f"{key} {model}", lambda p=folder, t=truth, m=model: theirs(p, t, m))
-                    for model in RIVALS
-                }
-                rows.append((right(mine), any(right(row) for row in other.values()), mine))
-    solvable = [row for row in rows if row[1]]
-    print(f"right: cgwm {sum(row[0] for row in rows)} of {len(rows)}, COLMAP with its best model {len(solvable)}")
-    print(f"of these cgwm {sum(row[0] for row in solvable)}")
-    wrong = [row[2] for row in rows if not row[0] and row[2]["registered"] > 0]
+    arguments.photos.mkdir(parents=True, exist_ok=True)
+    store = Store("calibrate_objects", arguments.results, any_commit=True)
+    names, seeds = arguments.objects.split(","), [int(value) for value in arguments.seeds.split(",")]
+    sets = {
+        f"{name} {session.background} {session.motion} {seed}": (arguments.ycb, arguments.photos, name, session)
+        for seed in seeds
+        for name in names
+        for session in sessions(seed)
+    }
+    wanted = {}
+    for seed in seeds:  # what makes the photos comes first
+        for one in arguments.contenders.split(","):
+            wanted |= {f"{key} {one}": (*value, one) for key, value in sets.items() if key.endswith(f" {seed}")}
+    store.fill(measured, wanted, arguments.workers)
+    rows = [
+        (mine, [row for one in RIVALS if (row := store.known(f"{key} {one}")) is not None])
+        for key in sets
+        if (mine := store.known(f"{key} cgwm")) is not None
+    ]
+    print_counts(rows)
+    return 0
+
+
+def print_counts(rows: list[tuple[dict[str, Any], list[dict[str, Any]]]]) -> None:
+    """Print how many sets are right, of those that COLMAP solves and of all, and how wrong ones were written."""
+    solved = [mine for mine, others in rows if any(right(row) for row in others)]
+    mine = [row for row, _ in rows]
+    print(f"right: cgwm {sum(map(right, mine))} of {len(mine)}, COLMAP with its best model {len(solved)}")
+    print(f"of these cgwm {sum(map(right, solved))}")
+    wrong = [row for row in mine if not right(row) and row["registered"] > 0]
     silent = [row for row in wrong if row["registered"] == PHOTOS and not _said(row)]
     print(f"written but not right: {len(wrong)}, of these complete and without a warning of its centres: {len(silent)}")
-    print(f"right with such a warning: {sum(row[0] and _said(row[2]) for row in rows)}")
-    return 0
+    print(f"right with such a warning: {sum(right(row) and _said(row) for row in mine)}")
 
 
 if __name__ == "__main__":

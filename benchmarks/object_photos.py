@@ -80,8 +80,9 @@ def photograph(painted: Painted, session: Session) -> tuple[list[NDArray[np.uint
     for place in places:
         image, mask = _shaded(painted, _ideal(session, place), session, place)
         if session.background == "clutter":
-            # on a turntable the table stands, as the camera does: it is seen from where the first photo was taken
-            behind = _table(session, painted.mesh, place if session.motion == "hand" else places[0])
+            # on a turntable the table stands; the camera does, too, and is raised once
+            first = places[0 if len(photos) < session.count // 2 else session.count // 2]
+            behind = _table(session, painted.mesh, place if session.motion == "hand" else first)
             image = np.where(mask[..., None] > 0, image, behind)
         photos.append(_developed(image, session, rng))
         masks.append(_through_lens(mask, session, cv2.INTER_NEAREST))

@@ -58,6 +58,7 @@ _PUBLIC = {
     "import_video": ".datasets.importers.walk_video",
     "import_photos": ".datasets.importers.photo_folder",
     "improve": ".pipeline.improve",
+    "mask": ".pipeline.mask",
     "merge": ".pipeline.synthesize",
     "open_view": ".pipeline.view",
     "read_model": ".datasets.models",
@@ -116,6 +117,7 @@ if TYPE_CHECKING:
     from .pipeline.export import export
     from .pipeline.fit import fit
     from .pipeline.improve import improve
+    from .pipeline.mask import mask
     from .pipeline.runtime.doctor import doctor
     from .pipeline.synthesize import (
         merge,
@@ -191,6 +193,7 @@ __all__ = [
     "import_tum",
     "import_video",
     "improve",
+    "mask",
     "merge",
     "open_view",
     "read_model",

@@ -18,6 +18,7 @@ from .export import export
 from .fit import fit
 from .import_ import import_capture
 from .improve import improve
+from .mask import mask
 from .merge import merge
 from .synthesize import synthesize
 from .validate import validate
@@ -25,6 +26,7 @@ from .view import view
 
 VERBS = (
     ("demo", demo, "Run the whole pipeline on a simulated scene."),
+    ("mask", mask, "Cut a body out of photos: masks for calibrate and fit."),
     ("calibrate", calibrate, "Estimate cameras from photos, with a metric scale."),
     ("fit", fit, "Fit a world model to a capture."),
     ("synthesize", synthesize, "Make labelled rollouts of a model, in HDF5."),
@@ -37,7 +39,7 @@ VERBS = (
     ("control", control, "Let a robot act through a model."),
     ("import", import_capture, "Convert recordings in another format to a capture."),
     ("export", export, "Convert a dataset or model to another tool's format."),
-    ("validate", validate, "Check a capture, model, dataset, ladder or run."),
+    ("validate", validate, "Check a capture, model, dataset, ladder, run or masks."),
     ("doctor", doctor, "Report what this machine has and what would be used."),
 )
 

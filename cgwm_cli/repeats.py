@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-REMEMBERED = frozenset({"import-capture", "demo", "export", "merge"})
+REMEMBERED = frozenset({"import-capture", "demo", "export", "mask", "merge"})
 """Verbs whose output records its request. A fit and a dataset tell themselves what they were made of."""
 _MANNERS = frozenset({"out", "overwrite", "resume", "trust_effects", "json", "quiet", "debug"})
 """Options that do not change what is written."""

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 def validate(
     thing: Annotated[
-        Path, typer.Argument(metavar="THING", help="A capture, model, dataset, ladder or run.", show_default=False)
+        Path,
+        typer.Argument(metavar="THING", help="A capture, model, dataset, ladder, run or masks.", show_default=False),
     ],
     sample: Annotated[
         int | None,
@@ -30,7 +31,7 @@ def validate(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Check a capture, a model, a dataset, a ladder or a run: schema, units, finite numbers, hashes."""
+    """Check a capture, a model, a dataset, a ladder, a run or masks: schema, units, finite numbers, hashes."""
     with running(json=json, quiet=quiet, debug=debug) as emit:
         from ..pipeline.validate import validate as work
 

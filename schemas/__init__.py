@@ -138,6 +138,7 @@ from .improve import (
     ImproveTrial,
 )
 from .intrinsics import IntrinsicsFile, TargetPhoto, TargetSheet
+from .masks import MasksReport
 from .model import (
     MODEL_FORMAT,
     BodyModel,
@@ -263,6 +264,7 @@ __all__ = [
     "LawTerm",
     "Light",
     "Marker",
+    "MasksReport",
     "Material",
     "MaterialPair",
     "Measurement",

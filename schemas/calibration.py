@@ -104,6 +104,8 @@ class CalibrationReport(FileModel):
     attempts: tuple[CalibrationAttempt, ...]
     center_std_percent: float | None = None
     """Median over the registered images of the standard deviation of the optical centre [% of the centres' extent]."""
+    turntable_rings: tuple[int, ...] = ()
+    """Number of photos of each ring, where the camera stood before a turntable: poses are then those of its motion."""
     focal_lengths: dict[str, FocalFigures] = {}
     """By camera, where the EXIF data name a focal length and the intrinsics were estimated."""
     scale: Scale
@@ -130,6 +132,7 @@ class CalibrationReport(FileModel):
             f"{self.points} points, reprojection {self.reprojection_error_px:.2f} px, {self.wall_time_s:.0f} s",
             f"self-check: {_passed(self.self_check)}",
             *(f"camera model: {one.camera_model}" for one in self.attempts if one.outcome == "taken"),
+            *([f"turntable: {_counted(self.turntable_rings)}"] if self.turntable_rings else []),
             *(
                 f"focal length of '{camera}': {one.px:.0f} px (matches {one.matches_px:.0f} +- "
                 f"{one.matches_std_percent:.2g} %, EXIF {one.exif_px:.0f} +- 3 %)"
@@ -163,6 +166,12 @@ class CalibrationReport(FileModel):
             f"optical centres: +- {self.center_std_percent:.2g} % of their extent (median), "
             f"+- {known[worst]:.2g} % at {worst}"
         ]
+
+
+def _counted(rings: tuple[int, ...]) -> str:
+    """Return the words for the numbers of photos of rings."""
+    places = "one place" if len(rings) == 1 else f"{len(rings)} places"
+    return f"the camera stood at {places} ({', '.join(map(str, rings))} photos), what it shows turned about one axis"
 
 
 def _passed(check: SelfCheckFigures) -> str:

@@ -28,7 +28,7 @@ class ValidationReport(FileModel):
     """The outcome of a validation: what was measured, and what is wrong."""
 
     path: str
-    kind: Literal["capture", "model", "dataset", "ladder", "run", "intrinsics"]
+    kind: Literal["capture", "model", "dataset", "ladder", "run", "masks", "intrinsics"]
     facts: dict[str, Any] = {}
     """What was found: counts, units, measured accuracies."""
     faults: tuple[str, ...] = ()

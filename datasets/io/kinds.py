@@ -1,4 +1,4 @@
-"""Detection of the kind of a directory: capture, model, dataset, ladder of models or run of a task of control."""
+"""Detection of the kind of a directory: capture, model, dataset, ladder of models, run of control, or masks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal
 
 from ...schemas import CAPTURE_FORMAT, InputDataError
 
-Kind = Literal["capture", "model", "dataset", "ladder", "run"]
+Kind = Literal["capture", "model", "dataset", "ladder", "run", "masks"]
 
 _MARKS: dict[Kind, str] = {
     "capture": "capture.toml",
@@ -15,6 +15,7 @@ _MARKS: dict[Kind, str] = {
     "dataset": "dataset.json",
     "ladder": "improve.json",
     "run": "control.json",
+    "masks": "masks.json",
 }
 _USED_BY: dict[Kind, str] = {
     "capture": "cgwm calibrate, fit, compare and diagnose take one",
@@ -22,6 +23,7 @@ _USED_BY: dict[Kind, str] = {
     "dataset": "cgwm eval takes one as its target",
     "ladder": "cgwm validate takes one, the other commands one of its models",
     "run": "cgwm validate takes one",
+    "masks": "cgwm calibrate and fit read them as CAPTURE/masks",
 }
 
 

@@ -31,8 +31,8 @@ _HASHED_BYTES = 1 << 16
 _HEAD_BYTES = 1 << 12
 
 DirectoryKind = Literal[
-    "model", "dataset", "capture", "demo", "ladder", "run", "LeRobot dataset", "BOP dataset", "nerfstudio capture",
-    "COLMAP model", "splat folder", "URDF folder", "SDF folder",
+    "model", "dataset", "capture", "demo", "ladder", "run", "masks", "LeRobot dataset", "BOP dataset",
+    "nerfstudio capture", "COLMAP model", "splat folder", "URDF folder", "SDF folder",
 ]  # fmt: skip
 FileKind = Literal[
     "page", "MJCF file", "USD file", "glTF file", "splat file", "index", "effect", "effect template", "calibration",

@@ -14,10 +14,12 @@ from . import colmap
 from .camera_models import FIRST_TRIED, LADDER, richer, supported
 from .center_uncertainty import focal_stds
 from .consistency_check import SelfCheck, check_model
-from .focal_prior import FocalLength, focal_lengths
+from .focal_prior import EXIF_STD, FocalLength, focal_lengths
 from .mapping import Mapped, adjusted, map_database, with_focal_lengths, without_outliers
 from .photos import Inputs
 from .reconstruction import SfmModel, VerifiedPair
+from .turntable_cameras import TurntableCameras, on_turntable
+from .turntable_motion import TurntableMotion
 
 MIN_PHOTOS = 3
 """Minimum number of photos, and of registered ones."""
@@ -26,6 +28,8 @@ MIN_REGISTERED_FRACTION = 0.5
 _LOW_PEAK_THRESHOLD = 0.002  # conventions: worked for weak texture
 _THOROUGH_TRIALS = 10000  # COLMAP's default: finds pairs with few true matches
 _TIGHT_RATIO = 0.7  # Lowe's test for repeated texture
+_RICHEST_ON_TURNTABLE = "RADIAL"
+"""Tangential distortion can hardly be told from a rotation of the camera where the camera always stands alike."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +50,8 @@ class Candidate:
     """Number of features by image."""
     focals: dict[str, FocalLength]
     """Focal lengths of the cameras with EXIF data, by camera."""
+    motion: TurntableMotion | None
+    """The turntable that the poses of the model are on; None where cameras are free."""
     attempt: int
     """Number of the attempt."""
 
@@ -75,7 +81,7 @@ def search(folder: Path, inputs: Inputs, config: CalibrateConfig) -> tuple[Candi
         if incomplete and built is not None and settings.features == built.features:
             continue  # Another seed registers no more images, but more features may.
         second_try = bool(passed)
-        candidate, attempt = _attempt(folder, inputs, settings, built, len(attempts))
+        candidate, attempt = _attempt(folder, inputs, settings, built, len(attempts), config.turntable)
         attempts.append(attempt)
         built, last = settings, candidate
         if candidate is not None and candidate.check.passed:
@@ -112,7 +118,12 @@ def _plan(config: CalibrateConfig) -> list[colmap.SfmSettings]:
 
 
 def _attempt(
-    folder: Path, inputs: Inputs, settings: colmap.SfmSettings, built: colmap.SfmSettings | None, number: int
+    folder: Path,
+    inputs: Inputs,
+    settings: colmap.SfmSettings,
+    built: colmap.SfmSettings | None,
+    number: int,
+    turntable: bool | None,
 ) -> tuple[Candidate | None, CalibrationAttempt]:
     names = {source.image.name: source.label for source in inputs.sources}
     reuse = built is not None and built.matches == settings.matches
@@ -135,6 +146,9 @@ def _attempt(
     if models:
         features = {names[name]: count for name, count in colmap.feature_counts(database).items()}
         named = tuple(one.model().renamed(names) for one in models)
+        found = None if turntable is False else _on_turntable(named, pairs, inputs, focals)
+        if found is not None:
+            named, camera_model = (found.model, *named[1:]), found.camera_model
         candidate = Candidate(
             model=named[0],
             camera_model=camera_model,
@@ -143,6 +157,7 @@ def _attempt(
             pairs=pairs,
             features=features,
             focals=focals,
+            motion=found.motion if found else None,
             attempt=number,
         )
     return candidate, _attempt_figures(settings, candidate)
@@ -187,6 +202,22 @@ def _with_exif(
     focals = focal_lengths(exif_px, matches_px, focal_stds(model, models))
     combined = {camera: focal.combined_px for camera, focal in focals.items() if focal.agree}
     return with_focal_lengths(mapped, combined, inputs.known, seed) if combined else mapped, focals
+
+
+def _on_turntable(
+    models: Sequence[SfmModel],
+    pairs: Sequence[VerifiedPair],
+    inputs: Inputs,
+    focals: dict[str, FocalLength],
+) -> TurntableCameras | None:
+    """Return the cameras of a turntable, where the matches support one."""
+    cameras = {source.label: source.image.camera for source in inputs.sources}
+    lenses = {
+        name: {camera: model for camera, model in limited(name, inputs).items() if camera not in inputs.known}
+        for name in (LADDER[:1] if _all_known(inputs) else LADDER[: LADDER.index(_RICHEST_ON_TURNTABLE) + 1])
+    }
+    exif = {camera: (focal.exif_px, EXIF_STD) for camera, focal in focals.items() if focal.agree}
+    return on_turntable(models, pairs, cameras, lenses, exif)
 
 
 def estimated(camera_model: str, model: SfmModel, inputs: Inputs) -> dict[str, str]:

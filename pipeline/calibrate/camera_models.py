@@ -46,14 +46,15 @@ def supported(residuals_px: Sequence[tuple[str, Array]], cameras: int) -> str:
         cameras: Number of cameras that have such a model.
     """
     noise = noise_px(residuals_px[-1][1])
-    taken, least = residuals_px[0][0], _cost(residuals_px[0][1], noise)
+    taken, least = residuals_px[0][0], robust_cost(residuals_px[0][1], noise)
     for model, lengths in residuals_px[1:]:
-        cost = _cost(lengths, noise)
+        cost = robust_cost(lengths, noise)
         price = cameras * (LENS_PARAMETERS[model] - LENS_PARAMETERS[taken]) * np.log(2 * len(lengths))
         if least - cost > max(price, LEAST_GAIN * least):
             taken, least = model, cost
     return taken
 
 
-def _cost(lengths_px: Array, noise: float) -> float:
+def robust_cost(lengths_px: Array, noise: float) -> float:
+    """Return the truncated sum of squares of errors [px], in units of their noise [px]."""
     return float(np.minimum((lengths_px / noise) ** 2, _TRUNCATE**2).sum())

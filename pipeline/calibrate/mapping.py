@@ -20,7 +20,7 @@ from .colmap import camera_names, count, run
 from .reconstruction import Array, SfmCamera, SfmModel
 
 _MIN_MODEL_IMAGES = 3
-_LOSS_SCALE = 2.0
+LOSS_SCALE = 2.0
 """Scale of the Cauchy loss, in standard deviations of a coordinate of the residuals."""
 _LEAST_NOISE_PX = 0.1
 """Lower bound of that standard deviation [px]; without one, exact observations would have no scale."""
@@ -201,7 +201,7 @@ def _adjust(reconstruction: Any, fixed: set[int], seed: int, focal_lengths: bool
     options.print_summary = False
     options.refine_focal_length = focal_lengths
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = _LOSS_SCALE * noise_px(lengths)
+    options.ceres.loss_function_scale = LOSS_SCALE * noise_px(lengths)
     options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
     for image in reconstruction.images.values():

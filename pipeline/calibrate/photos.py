@@ -19,9 +19,16 @@ from ...datasets.capture.exif import photo_lens
 from ...datasets.capture.images import image_size, write_image
 from ...datasets.io.progress import progress
 from ...schemas import CameraIntrinsics, InputDataError
+from ..foreground.standing_camera import (
+    places_of_camera,
+    probes,
+    reduced,
+    seems_to_stand,
+    surroundings,
+    turning,
+)
 from .colmap import SfmImage
 from .given_intrinsics import known_by_size
-from .turntable import camera_stands, probes, reduced, surroundings, turning
 
 STILL_BELOW_PX = 2.0
 """Threshold on the median displacement of the background per 1000 px of image width [px], for a static camera."""
@@ -76,9 +83,14 @@ def gather(capture: Capture, folder: Path, intrinsics: Path | None = None, turnt
     """
     root = folder / "images"
     sources, notes, richest = _photos(capture, root)
-    if turntable or (turntable is None and _turns(capture)):
-        sources, note = _without_surroundings(capture, folder, sources)
-        notes.append(note)
+    if turntable or (turntable is None and _seems_to_turn(capture)):
+        small = [reduced(capture.photo(source.label)) for source in sources]
+        places = places_of_camera(small)
+        if turntable and not places:
+            places = _places_by_size(small)
+        if places:
+            sources, note = _without_surroundings(capture, folder, sources, small, places)
+            notes.append(note)
     moving: dict[str, str] = {}
     for camera in capture.video_cameras():
         frames, masks = _probe_frames(capture, camera)
@@ -159,48 +171,67 @@ def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str], dict
     return sources, notes, richest
 
 
-def _turns(capture: Capture) -> bool:
-    return camera_stands([reduced(capture.photo(name)) for name in probes(capture.photos())])
+def _seems_to_turn(capture: Capture) -> bool:
+    pairs = [(reduced(capture.photo(a)), reduced(capture.photo(b))) for a, b in probes(capture.photos())]
+    return seems_to_stand(pairs)
 
 
-def _without_surroundings(capture: Capture, folder: Path, sources: list[Source]) -> tuple[list[Source], str]:
+def _places_by_size(photos: Sequence[NDArray[np.uint8]]) -> list[list[int]]:
+    """Return the indices of photos by their size: where a user says that the camera stood, and too little shows it."""
+    sizes = [photo.shape for photo in photos]
+    return [[k for k, size in enumerate(sizes) if size == one] for one in dict.fromkeys(sizes)]
+
+
+def _without_surroundings(
+    capture: Capture,
+    folder: Path,
+    sources: list[Source],
+    small: Sequence[NDArray[np.uint8]],
+    places: Sequence[Sequence[int]],
+) -> tuple[list[Source], str]:
     """Write masks that leave out the surroundings, which stand; return the sources with them, and a note.
 
-    What `masks/` shows of bodies is kept, too.
+    What `masks/` shows of bodies is kept, too. Photos from no place of the camera are kept whole.
+
+    Args:
+        capture: The capture.
+        folder: Folder of the masks.
+        sources: The photos.
+        small: The same, reduced.
+        places: Indices of the photos that were taken from each place of the camera.
     """
-    small = [reduced(capture.photo(source.label)) for source in sources]
-    sizes = {photo.shape for photo in small}
-    if len(sizes) > 1:
-        raise InputDataError(
-            f"{capture.root / 'images'}: photos of {len(sizes)} sizes, of a camera that stands.",
-            "photos of one size, from which the surroundings that stand can be told.",
-            "leave out photos of other sizes, or --set calibrate.turntable=false.",
-        )
-    color, known = surroundings(small)
-    shares = []
-    for source, photo in zip(progress(sources, "surroundings", unit="image"), small, strict=True):
-        width, height = image_size(capture.root / "images" / source.label)
-        small_mask = turning(photo, color, known).astype(np.uint8)
-        keep = np.asarray(cv2.resize(small_mask, (width, height), interpolation=cv2.INTER_NEAREST), bool)
-        given = capture.photo_mask(source.label)
-        if given is not None and given.shape == keep.shape:
-            keep = keep | (given > 0)
-        path = folder / "masks" / f"{source.image.name}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, np.where(keep, 255, 0).astype(np.uint8))
-        shares.append(float(keep.mean()))
+    kept = [np.ones(photo.shape[:2], bool) for photo in small]
+    for place in places:
+        color, known = surroundings([small[k] for k in place])
+        for k in place:
+            kept[k] = turning(small[k], color, known)
+    shares = [float(keep.mean()) for keep in kept]
     if not any(shares):
         raise InputDataError(
             f"{capture.root / 'images'}: all photos are the same: the camera stands, and nothing moves.",
             "photos from many sides.",
             "move the camera, or turn the object, between photos.",
         )
+    for source, keep in zip(progress(sources, "surroundings", unit="image"), kept, strict=True):
+        _write_kept(capture, folder, source, keep)
     note = (
         f"the camera stands and what it shows turns: features are of the {100 * np.mean(shares):.0f} % of the pixels "
         "that differ from the surroundings; a fit needs masks/ of the bodies, as the surroundings do not turn with "
         "them (if that is wrong: --set calibrate.turntable=false)"
     )
     return [replace(one, image=replace(one.image, mask=folder / "masks", stands=True)) for one in sources], note
+
+
+def _write_kept(capture: Capture, folder: Path, source: Source, small: NDArray[np.bool_]) -> None:
+    """Write which pixels of a photo features are taken from, with those that `masks/` shows of bodies."""
+    width, height = image_size(capture.root / "images" / source.label)
+    keep = np.asarray(cv2.resize(small.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST), bool)
+    given = capture.photo_mask(source.label)
+    if given is not None and given.shape == keep.shape:
+        keep = keep | (given > 0)
+    path = folder / "masks" / f"{source.image.name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, np.where(keep, 255, 0).astype(np.uint8))
 
 
 def _alike(one: str, other: str, sizes: Map[str, tuple[int, int]], lenses: Map[str, int]) -> bool:

@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -96,7 +97,7 @@ def calibrate(
         inputs = gather(capture, folder, intrinsics, config.turntable)
         best, attempts = search(folder, inputs, config)
     frame, similarity, world_frame, warnings = _world(capture, best.model)
-    model = best.model.transformed(similarity)
+    model = _colored(capture, best.model).transformed(similarity)
     cameras = _cameras_file(model, _scale(frame))
     report = _report(capture, inputs, config, best, attempts, model, cameras.scale, world_frame)
     report = report.model_copy(
@@ -109,6 +110,19 @@ def calibrate(
     )
     _write(capture_root, cameras, model, report, overwrite)
     return report
+
+
+def _colored(capture: Capture, model: SfmModel) -> SfmModel:
+    """Return a model whose points have the mean colours of the photos' pixels that show them, if they had none."""
+    if model.colors.any():
+        return model
+    total, count = np.zeros((len(model.points), 3)), np.zeros(len(model.points))
+    for image in set(model.observations) & set(capture.photos()):
+        photo, (pixels, seen) = capture.photo(image), model.observations[image]
+        column, row = np.clip(pixels.astype(int), 0, np.array(photo.shape[1::-1]) - 1).T
+        np.add.at(total, seen, photo[row, column])
+        np.add.at(count, seen, 1)
+    return replace(model, colors=(total / np.maximum(count, 1)[:, None]).round().astype(np.uint8))
 
 
 def _input_sha256(root: Path, intrinsics: Path | None) -> str:
@@ -280,6 +294,7 @@ def _report(
         world_frame=world_frame,
         ground_tilt_deg=tilt,
         ground_height_m=height,
+        turntable_rings=_rings(best),
         focal_lengths=_focal_figures(best),
         warnings=(*inputs.notes, *_warnings(best), *_wrong_exif(best), *_uncertain_centers(stds)),
         config=config,
@@ -293,8 +308,13 @@ def _center_stds_percent(best: Candidate, inputs: Inputs) -> dict[str, float]:
     models = estimated(best.camera_model, best.model, inputs)
     with_exif = [camera for camera, focal in best.focals.items() if focal.agree]
     return {
-        image: round(min(100.0 * std, 100.0), 4) for image, std in center_stds(best.model, models, with_exif).items()
+        image: round(min(100.0 * std, 100.0), 4)
+        for image, std in center_stds(best.model, models, with_exif, best.motion).items()
     }
+
+
+def _rings(best: Candidate) -> tuple[int, ...]:
+    return tuple(len(ring) for ring in best.motion.rings if len(ring) > 1) if best.motion else ()
 
 
 def _focal_figures(best: Candidate) -> dict[str, FocalFigures]:

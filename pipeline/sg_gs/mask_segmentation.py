@@ -21,23 +21,17 @@ from scipy.ndimage import map_coordinates
 from ...datasets.capture.cameras import Camera
 from ...datasets.capture.capture import Capture
 from ...schemas import Ground
+from ..foreground.graph_cut import Band, Mask, cut, dilated, eroded
+from ..foreground.plain_background import foreground
 from ..geometry.solid_grid import Array, crossings, grid_points
 from ..geometry.spheres import Spheres
 from ..rendering.render import render
-from .plain_background import foreground
 from .views import View, with_labels
 from .visual_hull import carve, largest_component, signed_distance_px
-
-Mask = NDArray[np.bool_]
 
 _SIZE = 800
 """Maximum longer side of the reduced photos [px]; masks are resized to the original size afterwards."""
 _RENDERED = 240
-_WINDOW_PX = 400
-"""Maximum size of the window of a body for a cut [px]."""
-_SURROUNDINGS = 0.25
-"""Width of the surroundings of the band that the background's colour model learns from, in units of its size."""
-_CUTS = 4
 _NARROW = 3.0
 """Half width of the second band, in units of the grid spacing of the solid."""
 _GRID = 72
@@ -108,9 +102,9 @@ def outline(
         ]
         excluded = [other | _beyond(blob, picture) for picture, other in zip(pictures, hidden, strict=True)]
         cuts = list(zip(pictures, bands, excluded, strict=True))
-        first = [_cut(picture.image, own[k].without(other)) for picture, own, other in cuts[fitted]]
+        first = [cut(picture.image, own[k].without(other)) for picture, own, other in cuts[fitted]]
         solid = _Solid.left_by(pictures[fitted], first, hidden[fitted], near, pitch, ground)
-        masks = [_cut(picture.image, solid.band(picture.camera).without(other)) for picture, _, other in cuts]
+        masks = [cut(picture.image, solid.band(picture.camera).without(other)) for picture, _, other in cuts]
         left = _Solid.left_by(pictures[fitted], masks[fitted], hidden[fitted], near, pitch, ground)
         agreements.append(_agreement(left, pictures[fitted], masks[fitted], hidden[fitted]))
         shares.append(float(np.mean([mask.mean() for mask in masks[fitted]])))
@@ -135,7 +129,7 @@ def outline_before_plain(capture: Capture, train: Sequence[View], test: Sequence
     starts = [start for picture in pictures if (start := foreground(picture.image)) is not None]
     if len(starts) < len(pictures):
         return None
-    masks = [_cut(p.image, _Band.about(start, start, _RIM_PX)) for p, start in zip(pictures, starts, strict=True)]
+    masks = [cut(p.image, Band.about(start, start, _RIM_PX)) for p, start in zip(pictures, starts, strict=True)]
     labels = [np.where(mask, index + 1, 0).astype(np.uint8) for mask in masks]
     bodies = len(capture.manifest.bodies)
     found = [with_labels(view, own, bodies) for view, own in zip(views, labels, strict=True)]
@@ -171,30 +165,9 @@ class _Picture:
         return _Picture(image, camera.resized(width, height), given)
 
 
-@dataclass(frozen=True)
-class _Band:
-    """Constraints on a mask."""
-
-    inside: Mask
-    """Pixels certainly inside, shape (H, W)."""
-    outside: Mask
-    """Pixels certainly outside, shape (H, W)."""
-    start: Mask
-    """Initial mask, shape (H, W)."""
-
-    def without(self, other: Mask) -> _Band:
-        """Return the band with further pixels that are certainly outside."""
-        return _Band(self.inside & ~other, self.outside | other, self.start & ~other)
-
-    @staticmethod
-    def about(start: Mask, core: Mask, width_px: float) -> _Band:
-        """Return a band that extends by `width_px` outside of `start` and inside of `core`."""
-        return _Band(_eroded(core, width_px), ~_dilated(start, width_px), start)
-
-
 def _wide_bands(
     picture: _Picture, spheres: Spheres, pitch: float, blobs: Sequence[Blob], ground: Ground | None
-) -> list[_Band]:
+) -> list[Band]:
     """Return a band around the spheres of each body, extended down to the ground."""
     seen = _rendered(picture.camera, spheres, blobs)
     bands = []
@@ -207,8 +180,8 @@ def _wide_bands(
             width = pitch * metre
             if ground is not None:
                 columns = _marked(picture.camera, _columns(points, pitch, ground))
-                start = core | _eroded(_dilated(columns, 0.7 * width), 0.7 * width)
-        bands.append(_Band.about(start, core, width))
+                start = core | eroded(dilated(columns, 0.7 * width), 0.7 * width)
+        bands.append(Band.about(start, core, width))
     return bands
 
 
@@ -248,37 +221,6 @@ def _beyond(blob: Blob, picture: _Picture) -> Mask:
     within = np.zeros(shape, np.uint8)
     cv2.fillConvexPoly(within, cv2.convexHull(np.round(pixel).astype(np.int32)), 1)
     return within == 0
-
-
-def _cut(image: NDArray[np.uint8], band: _Band) -> Mask:
-    """Return the mask of a body within a band, by GrabCut in a window around it."""
-    rows, columns = np.nonzero(~band.outside)
-    if len(rows) == 0 or not band.start.any():
-        return np.zeros(band.start.shape, bool)
-    more = 4 + int(_SURROUNDINGS * max(np.ptp(rows), np.ptp(columns)))
-    window = (
-        slice(max(rows.min() - more, 0), rows.max() + more + 1),
-        slice(max(columns.min() - more, 0), columns.max() + more + 1),
-    )
-    state = np.where(band.start, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    state[band.outside], state[band.inside & ~band.outside] = cv2.GC_BGD, cv2.GC_FGD
-    part, state = image[window], state[window]
-    height, width = state.shape
-    scale = min(1.0, _WINDOW_PX / max(height, width))
-    if scale < 1:
-        size = max(1, round(scale * width)), max(1, round(scale * height))
-        part = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
-        state = cv2.resize(state, size, interpolation=cv2.INTER_NEAREST)
-    part, state = np.ascontiguousarray(part), np.ascontiguousarray(state)
-    outer = (state == cv2.GC_BGD) | (state == cv2.GC_PR_BGD)
-    if not outer.any() or outer.all():  # GrabCut needs colours of both.
-        return band.start & ~band.outside
-    cv2.setRNGSeed(0)
-    cv2.grabCut(part, state, (0, 0, 1, 1), np.zeros((1, 65)), np.zeros((1, 65)), _CUTS, cv2.GC_INIT_WITH_MASK)
-    inner = ((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)).astype(np.float32)
-    mask = np.zeros(band.start.shape, bool)
-    mask[window] = cv2.resize(inner, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
-    return mask
 
 
 @dataclass(frozen=True)
@@ -330,13 +272,13 @@ class _Solid:
             return np.zeros((camera.height, camera.width), bool)
         # The points lie on the surface: discs close the gaps between them and are eroded again at the border.
         radius = 0.9 * self.pitch * metre + 0.5
-        return _eroded(_dilated(_marked(camera, self.surface), radius), radius)
+        return eroded(dilated(_marked(camera, self.surface), radius), radius)
 
-    def band(self, camera: Camera) -> _Band:
+    def band(self, camera: Camera) -> Band:
         """Return a narrow band around the border of the solid in a photo."""
         mask = self.seen_by(camera)
         width = _NARROW * self.pitch * (_pixels_per_metre(camera, self.surface) or 0.0)
-        return _Band.about(mask, mask, width)
+        return Band.about(mask, mask, width)
 
 
 def _look_up(row: Array, points: Array, mask: Mask, hidden: Mask, camera: Camera) -> None:
@@ -378,17 +320,3 @@ def _marked(camera: Camera, points: Array) -> Mask:
     mask = np.zeros((camera.height, camera.width), bool)
     mask[row[seen], column[seen]] = True
     return mask
-
-
-def _dilated(mask: Mask, radius_px: float) -> Mask:
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), _disc(radius_px))) > 0
-
-
-def _eroded(mask: Mask, radius_px: float) -> Mask:
-    # Space beyond the picture is unknown: a body that extends beyond it is not eroded at that border.
-    return np.asarray(cv2.erode(mask.astype(np.uint8), _disc(radius_px), borderValue=1)) > 0
-
-
-def _disc(radius_px: float) -> NDArray[np.uint8]:
-    side = 2 * max(0, round(radius_px)) + 1
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)

@@ -1,4 +1,4 @@
-"""The stage validate (`cgwm validate`): check that a capture, model, dataset, ladder of models or run is correct."""
+"""The stage validate (`cgwm validate`): check a capture, model, dataset, ladder of models, run or masks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import find_faults
-from ...datasets.io.kinds import kind_of
+from ...datasets.io.kinds import Kind, kind_of
 from ...datasets.models.agreement import require_contact
 from ...datasets.models.model import read_model
 from ...schemas import InputDataError, IntrinsicsFile, UsageError, read_json
@@ -17,10 +17,10 @@ from ...schemas.validation import ValidationReport
 def validate(
     thing: Path | str, sample: int | None = None, seed: int = 0, accept_units: bool = False
 ) -> ValidationReport:
-    """Check a capture, a model, a dataset, the ladder of models of `cgwm improve`, or a run of `cgwm control`.
+    """Check a capture, a model, a dataset, the ladder of models of `cgwm improve`, a run of `cgwm control`, or masks.
 
     Args:
-        thing: CAPTURE, MODEL, DATASET, RUN, the directory of a ladder, or the file `intrinsics.json` of a target.
+        thing: CAPTURE, MODEL, DATASET, RUN, MASKS, the folder of a ladder, or the file `intrinsics.json` of a target.
         sample: Number of rollouts of a dataset to check, drawn at random; None checks all.
         seed: Seed of that draw.
         accept_units: Do not refuse units and frames of a capture that its motion contradicts.
@@ -38,12 +38,26 @@ def validate(
     if path.is_file():
         return validate_intrinsics(path)
     kind = kind_of(path)
-    if sample is not None and kind in ("capture", "model", "ladder", "run"):
+    if sample is not None and kind in ("capture", "model", "ladder", "run", "masks"):
         raise UsageError(f"--sample: {path} is a {kind}, which is checked whole.", "a dataset.", "omit --sample.")
     if kind == "capture":
         return validate_capture(path, accept_units)
     if kind == "model":
         return validate_model(path)
+    if kind == "dataset":
+        from .dataset import validate_dataset
+
+        return validate_dataset(path, sample, seed)
+    if kind is not None:
+        return _validated_output(kind, path)
+    found = "no such directory" if not path.exists() else "no capture, model, dataset, ladder, run or masks"
+    raise InputDataError(
+        f"{path}: {found}.",
+        "a directory with capture.toml, model.json, dataset.json, improve.json, control.json or masks.json.",
+    )
+
+
+def _validated_output(kind: Kind, path: Path) -> ValidationReport:
     if kind == "ladder":
         from .ladder import validate_ladder
 
@@ -52,14 +66,9 @@ def validate(
         from .run import validate_run
 
         return validate_run(path)
-    if kind == "dataset":
-        from .dataset import validate_dataset
+    from .masks import validate_masks
 
-        return validate_dataset(path, sample, seed)
-    found = "no such directory" if not path.exists() else "no capture, model, dataset, ladder or run"
-    raise InputDataError(
-        f"{path}: {found}.", "a directory with capture.toml, model.json, dataset.json, improve.json or control.json."
-    )
+    return validate_masks(path)
 
 
 def validate_capture(path: Path | str, accept_units: bool = False) -> ValidationReport:

@@ -163,8 +163,8 @@ def test_an_unknown_verb(run: Run) -> None:
         2,
         "",
         "cgwm: there is no command 'fti'.\n"
-        "Allowed: demo, calibrate, fit, synthesize, merge, view, eval, compare, diagnose, improve, control, import, "
-        "export, validate, doctor, effects. "
+        "Allowed: demo, mask, calibrate, fit, synthesize, merge, view, eval, compare, diagnose, improve, control, "
+        "import, export, validate, doctor, effects. "
         "Did you mean 'fit'?\n"
         "Next: run 'cgwm --help'.\n",
     )

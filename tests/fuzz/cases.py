@@ -91,6 +91,7 @@ OPTIONS = {
     "export": ("--split", "--cameras", "--every", "--task", "--rollout", "--mask", "--sh-degree", "--duration"),
     "import": ("--train", "--test", "--seed", "--only", "--columns", "--length-unit", "--time-unit", "--body"),
     "view": ("--port", "--host"),
+    "mask": ("--box", "--photo", "--body"),
     "calibrate": ("--seed", "--target", "--intrinsics"),
 }  # fmt: skip
 

@@ -98,6 +98,8 @@ EVAL = command("eval model capture")
 COMPARE = command("compare model capture --out OUT.html", weight=0.7)
 DIAGNOSE = command("diagnose model capture --split look --page OUT.html", weight=0.3)
 IMPROVE = command("improve capture --from model --split look --steps 1 --out OUT", *FAST_FIT, weight=0.1)
+MASK = command("mask capture --out OUT", weight=0.5)
+BOX = command("mask capture --out OUT --box 4,4,40,40", weight=0.5)
 SPLATS = command("fit capture --out OUT", *FAST_SPLATS, weight=0.3)
 FIT_IMAGES = command(
     "fit capture --out OUT --stage phys-geo --from model --supervise images --set phys-geo.image_size=32",
@@ -137,7 +139,7 @@ SUBJECTS = {
     subject.name: subject
     for subject in (
         Subject("tracks", "captures", tracks, (VALIDATE, FIT, EVAL, COMPARE, DIAGNOSE, IMPROVE), ("capture/**/*",), 3),
-        Subject("photos", "captures", photographed, (VALIDATE, SPLATS), ("capture/**/*",), 2),
+        Subject("photos", "captures", photographed, (VALIDATE, SPLATS, MASK, BOX), ("capture/**/*",), 2),
         Subject("jointed", "captures", jointed, (VALIDATE,), ("capture/**/*",), 0.5),
         Subject("jointed mjcf", "captures", jointed_mjcf, (VALIDATE,), ("capture/elbow.xml",), 0.5),
         Subject("filmed", "captures", filmed, (VALIDATE, FIT_IMAGES), ("capture/**/*",), 1),

@@ -23,6 +23,7 @@ from pipeline.sg_gs.test_sg_gs import make_capture
 
 from datasets.importers import test_photo_importers, test_sensor_importers
 from pipeline.calibrate import test_calibrate
+from pipeline.mask import test_mask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +71,12 @@ def _calibrate(folder: Path) -> Command:
     words = ["calibrate", str(root), *_settings("calibrate.max_features=500", "calibrate.retries=0")]
     out = tuple(f"capture/{name}" for name in ("cameras.json", "calibration.json", "sparse_points.ply"))
     return Command(words=words, out=out, check=(["validate", str(root)],))
+
+
+def _mask(folder: Path) -> Command:
+    test_mask.folder(folder / "photos", test_mask.scene("one colour")[0])
+    words = ["mask", str(folder / "photos"), "--out", str(folder / "out")]
+    return Command(words=words, out=("out",), check=(["validate", str(folder / "out")],))
 
 
 def _target(folder: Path) -> Command:
@@ -202,6 +209,8 @@ def _control(folder: Path) -> Command:
 
 # not `export --to rerun`: Rerun stamps what it writes with the time, so that no two runs give the same bytes
 CASES: dict[str, Callable[[Path], Command]] = {
+    "mask": _mask,
+    "mask --overwrite": _replacing(_mask, "--box", "30,20,90,70"),
     "calibrate": _calibrate,
     "calibrate --overwrite": _replacing(_calibrate, "--seed", "5", "--set", "calibrate.max_features=600"),
     "calibrate target": _target,

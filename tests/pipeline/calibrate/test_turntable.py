@@ -1,5 +1,6 @@
 """Photos of what turns before a camera that stands: they are recognised, and the surroundings found."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,7 @@ import pytest
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.images import read_label, write_image
 from cgwm.pipeline.calibrate.photos import gather
-from cgwm.pipeline.calibrate.turntable import camera_stands, surroundings, turning
+from cgwm.pipeline.foreground.standing_camera import places_of_camera, probes, seems_to_stand, surroundings, turning
 from cgwm.schemas import InputDataError
 
 HEIGHT, WIDTH, COUNT = 90, 120, 12
@@ -34,7 +35,8 @@ def photos(standing: bool) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 def test_the_pixels_that_turn_are_found_without_masks() -> None:
     made, discs = photos(standing=True)
-    assert camera_stands(made[::2])
+    assert seems_to_stand(list(pairwise(made)))
+    assert places_of_camera(made) == [list(range(COUNT))]
     color, known = surroundings(made)
     for image, disc in zip(made, discs, strict=True):
         found = turning(image, color, known)
@@ -44,10 +46,18 @@ def test_the_pixels_that_turn_are_found_without_masks() -> None:
 
 def test_a_camera_that_moves_or_sees_no_texture_does_not_stand() -> None:
     made, discs = photos(standing=False)
-    assert not camera_stands(made[::2])
+    assert not seems_to_stand(list(pairwise(made))) and not places_of_camera(made)
     plain = [np.where(disc[..., None], image, 0) for image, disc in zip(made, discs, strict=True)]
-    assert not camera_stands(plain[::2])
-    assert not camera_stands(made[:1]) and not camera_stands([made[0], made[0][1:]])
+    assert not seems_to_stand(list(pairwise(plain)))
+    assert not seems_to_stand([]) and not seems_to_stand([(made[0], made[0][1:])])
+    assert probes(["a"]) == [] and probes(["a", "b", "c"]) == [("a", "b"), ("b", "c")]
+
+
+def test_each_place_of_the_camera_has_its_own_surroundings() -> None:
+    low, _ = photos(standing=True)
+    high = [image[::-1].copy() for image in low]
+    assert places_of_camera([*low[:6], *high[:7]]) == [list(range(6)), list(range(6, 13))]
+    assert places_of_camera([*low[:6], *high[:2]]) == []  # a quarter of the photos is from no such place
 
 
 def capture(root: Path, images: list[np.ndarray]) -> Path:
@@ -77,4 +87,4 @@ def test_features_are_taken_from_what_turns_and_from_given_masks(tmp_path: Path)
 def test_photos_that_are_all_the_same_are_refused(tmp_path: Path) -> None:
     made, _ = photos(standing=True)
     with pytest.raises(InputDataError, match=r"all photos are the same"):
-        gather(Capture.open(capture(tmp_path / "capture", [made[0]] * 4)), tmp_path / "work")
+        gather(Capture.open(capture(tmp_path / "capture", [made[0]] * 5)), tmp_path / "work")

@@ -1,0 +1,64 @@
+"""The verb `cgwm mask`: masks of a body in photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .execution import Emit
+from .options import Overwrite
+from .verb import verb
+
+
+@verb
+def mask(
+    emit: Emit,
+    source: Annotated[
+        Path, typer.Argument(metavar="CAPTURE|PHOTOS", help="A capture, or a folder of photos.", show_default=False)
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", metavar="DIR", help="The directory to write; of a capture usually CAPTURE/masks.",
+                     show_default=False),
+    ],
+    box: Annotated[
+        str | None,
+        typer.Option("--box", metavar="X0,Y0,X1,Y1",
+                     help="Borders of the body in one photo [px]: left, upper, right, lower. Without it, the body is "
+                     "what stands before one colour, or turns before surroundings that stand.", show_default=False),
+    ] = None,
+    photo: Annotated[
+        str | None,
+        typer.Option("--photo", metavar="NAME", help="The photo that --box is about.", show_default="the first"),
+    ] = None,
+    body: Annotated[
+        str | None,
+        typer.Option("--body", metavar="NAME", help="The body of the capture.", show_default="the only one"),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:  # fmt: skip
+    """Write masks of a body in photos, as calibrate and fit read them: 0 behind the body, its label on it."""
+    from ..schemas import UsageError
+
+    if photo is not None and box is None:
+        raise UsageError("--photo names the photo of a box, and there is no --box.", todo="give both or neither.")
+    borders = None if box is None else _borders(box)
+    from ..pipeline.mask import mask as work
+
+    emit(work(source, out, borders, photo, body, overwrite), str)
+
+
+def _borders(text: str) -> tuple[float, float, float, float]:
+    import math
+
+    from ..schemas import UsageError
+
+    try:
+        left, upper, right, lower = (float(word) for word in text.split(","))
+    except ValueError:
+        left = upper = right = lower = math.nan
+    if not all(map(math.isfinite, (left, upper, right, lower))):
+        raise UsageError(f"--box {text}: not four numbers.", "x0,y0,x1,y1 in pixels, for example 120,80,520,430.")
+    return left, upper, right, lower

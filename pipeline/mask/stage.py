@@ -1,0 +1,186 @@
+"""The stage mask (`cgwm mask`): write masks of one body in photos, as calibrate and fit read them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.files import entries_of
+from ...datasets.capture.images import IMAGE_SUFFIXES, image_size, read_rgb, write_image
+from ...datasets.io.atomic import new_directory
+from ...datasets.io.kinds import kind_of
+from ...datasets.io.outputs import reads
+from ...datasets.io.progress import progress
+from ...schemas import CaptureManifest, InputDataError, MasksReport, NotConvergedError, UsageError, read_toml
+from ...schemas.masks import PhotoMask
+from ..foreground.graph_cut import Mask
+from .body_masks import before_plain, from_box, on_turntable
+from .doubts import doubts
+
+MASKS_NAME = "masks.json"
+
+_SIZE = 800
+"""Maximum longer side of the reduced photos [px]; masks are resized to the size of the photos."""
+_LEAST_FOUND = 0.5
+"""Least share of the photos in which the body has to be found."""
+
+
+@dataclass(frozen=True)
+class _Photos:
+    """Photos, and which body is masked in them."""
+
+    folder: Path
+    """Their folder."""
+    names: list[str]
+    """Their names relative to it, in order."""
+    body: str
+    """Name of the body, or empty."""
+    label: int
+    """Its label."""
+
+
+@reads("source")
+def mask(
+    source: Path | str,
+    out: Path | str,
+    box: tuple[float, float, float, float] | None = None,
+    photo: str | None = None,
+    body: str | None = None,
+    overwrite: bool = False,
+) -> MasksReport:
+    """Write masks of one body in photos: `<name>.png`, 0 behind the body, its label on it.
+
+    Without a box the body is what stands before a background of one colour, or what turns before surroundings that
+    stand (a turntable). With one, it is what the box holds in one photo; the other photos are cut by its colours.
+
+    Args:
+        source: A capture, or a folder of photos.
+        out: The directory to write; for a capture usually its `masks`.
+        box: Left, upper, right and lower border of the body in `photo` [px].
+        photo: Name of the photo that `box` is about; None takes the first.
+        body: Name of the body in the capture; None takes the only one.
+        overwrite: Replace `out`.
+
+    Returns:
+        What `masks.json` holds: how the body was found, and which masks should be looked at.
+
+    Raises:
+        InputDataError: If there are no photos, or no box is given and the photos do not tell the body.
+        UsageError: If `out` exists, the box is outside of its photo, or there is no such photo or body.
+        NotConvergedError: If the body is found in fewer than half of the photos.
+    """
+    with new_directory(out, "masks", overwrite) as directory:
+        given = _photos(Path(source), body)
+        reference = _reference(given, photo)
+        if box is not None:
+            _require_inside(given, reference, box)
+        small = [_reduced(read_rgb(given.folder / name)) for name in progress(given.names, "photos", unit="photo")]
+        method, masks = _masks(given, small, reference, box)
+        report = _report(given, method, masks)
+        for name, found in zip(given.names, masks, strict=True):
+            width, height = image_size(given.folder / name)
+            large = cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+            path = (directory / name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_image(path, np.where(large, given.label, 0).astype(np.uint8))
+        (directory / MASKS_NAME).write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    return report
+
+
+def _photos(source: Path, body: str | None) -> _Photos:
+    if kind_of(source) == "capture":
+        capture = Capture(source, read_toml(source / "capture.toml", CaptureManifest))
+        names = capture.photos()
+        folder, bodies = source / "images", [one.name for one in capture.manifest.bodies]
+    else:
+        names = [entry.name for entry in entries_of(source) if entry.suffix.lower() in IMAGE_SUFFIXES]
+        folder, bodies = source, []
+    if not names:
+        raise InputDataError(f"{folder}: no photos.", "photos .jpg, .jpeg or .png.", "name the folder that holds them.")
+    if body is not None and body not in bodies:
+        listed = ", ".join(bodies) or "none: a folder of photos has no bodies"
+        raise UsageError(f"--body {body}: no such body in {source}.", f"bodies: {listed}.", "name one of them.")
+    if body is None and len(bodies) > 1:
+        raise UsageError(
+            f"{source} has {len(bodies)} bodies: {', '.join(bodies)}.", "one body in a run.", "--body NAME."
+        )
+    chosen = body or (bodies[0] if bodies else "")
+    return _Photos(folder, names, chosen, bodies.index(chosen) + 1 if chosen else 1)
+
+
+def _reference(given: _Photos, photo: str | None) -> int:
+    if photo is None:
+        return 0
+    if photo not in given.names:
+        raise UsageError(
+            f"--photo {photo}: no such photo in {given.folder}.", f"for example {given.names[0]}.", "name one of them."
+        )
+    return given.names.index(photo)
+
+
+def _require_inside(given: _Photos, reference: int, box: Sequence[float]) -> None:
+    width, height = image_size(given.folder / given.names[reference])
+    left, upper, right, lower = box
+    if not (0 <= left < right <= width and 0 <= upper < lower <= height):
+        raise UsageError(
+            f"--box {','.join(f'{value:g}' for value in box)}: not inside {given.names[reference]}, which has "
+            f"{width} x {height} pixels.",
+            "x0,y0,x1,y1 with x0 < x1 and y0 < y1: left, upper, right and lower border.",
+            "read them off in an image viewer, with some pixels of the background all around the body.",
+        )
+
+
+def _reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    scale = min(1.0, _SIZE / max(image.shape[:2]))
+    if scale == 1.0:
+        return image
+    size = max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0]))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _masks(
+    given: _Photos, small: list[NDArray[np.uint8]], reference: int, box: tuple[float, float, float, float] | None
+) -> tuple[str, list[Mask]]:
+    if box is not None:
+        scale = small[reference].shape[1] / image_size(given.folder / given.names[reference])[0]
+        left, upper, right, lower = (scale * value for value in box)
+        return "box", from_box(small, reference, (left, upper, right, lower))
+    for method, found in (("plain", before_plain), ("turntable", on_turntable)):
+        masks = found(small)
+        if masks is not None:
+            return method, masks
+    raise InputDataError(
+        f"{given.folder}: the photos do not tell the body: what is behind it has more than one colour, and does not "
+        "stand still.",
+        "photos before one colour, or of a turntable, or a box around the body in one photo.",
+        f"--box x0,y0,x1,y1 [--photo NAME]: its borders in pixels, in {given.names[0]} unless --photo names another.",
+    )
+
+
+def _report(given: _Photos, method: str, masks: Sequence[Mask]) -> MasksReport:
+    photos = {
+        name: PhotoMask(share=round(float(found.mean()), 5), doubt=doubt)
+        for name, found, doubt in zip(given.names, masks, doubts(masks), strict=True)
+    }
+    empty = sum(not found.any() for found in masks)
+    if empty > (1 - _LEAST_FOUND) * len(masks):
+        raise NotConvergedError(
+            f"The body was found in {len(masks) - empty} of {len(masks)} photos.",
+            f"at least {_LEAST_FOUND:.0%} of them.",
+            "give a --box that holds the whole body and little else, in a photo from the middle of the series.",
+        )
+    return MasksReport.model_validate(
+        {
+            "method": method,
+            "body": given.body,
+            "label": given.label,
+            "photos": photos,
+            "versions": {"opencv": cv2.__version__},
+        }
+    )

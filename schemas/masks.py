@@ -1,0 +1,50 @@
+"""What `cgwm mask` writes beside the masks: `masks.json`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from .base import FileModel
+
+
+class PhotoMask(FileModel):
+    """The mask of a photo."""
+
+    share: float
+    """Share of the pixels that the body fills."""
+    doubt: str = ""
+    """Why the mask should be looked at; empty where nothing speaks against it."""
+
+
+class MasksReport(FileModel):
+    """`masks.json`."""
+
+    format: Literal["cgwm-masks/1"] = "cgwm-masks/1"
+    method: Literal["plain", "turntable", "box"]
+    """What told the body from the rest: a background of one colour, surroundings that stand, or a box."""
+    body: str = ""
+    """Name of the body; empty where the photos were not those of a capture with bodies."""
+    label: int
+    """Its label in the masks."""
+    photos: dict[str, PhotoMask]
+    """By photo."""
+    versions: dict[str, str] = {}
+
+    @property
+    def doubtful(self) -> dict[str, str]:
+        """The photos whose masks should be looked at, with the reason."""
+        return {name: photo.doubt for name, photo in self.photos.items() if photo.doubt}
+
+    def __str__(self) -> str:
+        """Return the summary that the command prints."""
+        shares = sorted(photo.share for photo in self.photos.values())
+        found = {
+            "plain": "what stands before a background of one colour",
+            "turntable": "what turns before surroundings that stand",
+            "box": "what is in the box, and looks alike in the other photos",
+        }[self.method]
+        lines = [
+            f"{len(self.photos)} masks of {self.body or 'the body'}, label {self.label}: {found}; it fills "
+            f"{100 * shares[0]:.1f} to {100 * shares[-1]:.1f} % of the photos"
+        ]
+        return "\n".join([*lines, *(f"look at {name}: {doubt}" for name, doubt in self.doubtful.items())])

@@ -1,0 +1,130 @@
+"""Masks of a body in photos without cameras: by one colour behind it, by what turns, and by a box in one photo."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from cgwm.datasets.capture.images import read_label, write_image
+from cgwm.pipeline.mask import mask
+from cgwm.pipeline.mask.doubts import doubts
+from cgwm.pipeline.validate import validate
+from cgwm.schemas import InputDataError, NotConvergedError, OutputExistsError, UsageError
+
+HEIGHT, WIDTH, COUNT = 90, 120, 6
+BOX = (40.0, 23.0, 88.0, 68.0)
+"""About the disc in the first photo."""
+
+
+def texture(seed: int, low: float, high: float) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    coarse = rng.uniform(low, high, (HEIGHT // 6, WIDTH // 6, 3)).astype(np.float32)
+    return cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+
+
+def scene(behind: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return photos of a reddish disc that moves a little before something that is not, and where it is."""
+    rng, photos, discs = np.random.default_rng(0), [], []
+    for k in range(COUNT):
+        center = (64 + round(7 * np.sin(1.3 * k)), 45)
+        disc = cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), center, 19, 1, cv2.FILLED)
+        body = texture(k, 20, 90) + np.array([140.0, 0.0, 0.0])
+        back = {"one colour": np.full((HEIGHT, WIDTH, 3), 250.0), "what stands": texture(90, 0, 160),
+                "what moves": texture(90 + k, 0, 160)}[behind] * np.array([0.6, 1.0, 1.0])  # fmt: skip
+        image = np.where(disc[..., None] > 0, body, back) + rng.normal(0, 2, (HEIGHT, WIDTH, 3))
+        photos.append(image.clip(0, 255).astype(np.uint8))
+        discs.append(disc.astype(bool))
+    return photos, discs
+
+
+def folder(root: Path, photos: list[np.ndarray]) -> Path:
+    root.mkdir(parents=True)
+    for k, photo in enumerate(photos):
+        write_image(root / f"{k}.png", photo)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("behind", "box", "method", "least"),
+    [("one colour", None, "plain", 0.95), ("what stands", None, "turntable", 0.9), ("what moves", BOX, "box", 0.9)],
+)
+def test_the_body_is_cut_out(tmp_path: Path, behind: str, box: None, method: str, least: float) -> None:
+    photos, discs = scene(behind)
+    report = mask(folder(tmp_path / "photos", photos), tmp_path / "masks", box)
+    assert report.method == method and report.label == 1 and not report.doubtful
+    for k, disc in enumerate(discs):
+        found = read_label(tmp_path / "masks" / f"{k}.png")
+        assert set(np.unique(found)) == {0, 1}
+        assert ((found > 0) & disc).sum() / ((found > 0) | disc).sum() > least
+    assert validate(tmp_path / "masks").faults == ()
+
+
+def test_a_capture_gets_the_label_of_its_body(tmp_path: Path) -> None:
+    folder(tmp_path / "capture" / "images", scene("one colour")[0])
+    (tmp_path / "capture" / "capture.toml").write_text(
+        'format = "cgwm-capture/1"\n[[bodies]]\nname = "a"\n[[bodies]]\nname = "b"\n'
+    )
+    with pytest.raises(UsageError, match=r"has 2 bodies: a, b\.\nAllowed: one body in a run\.\nNext: --body NAME"):
+        mask(tmp_path / "capture", tmp_path / "capture" / "masks")
+    assert mask(tmp_path / "capture", tmp_path / "capture" / "masks", body="b").label == 2
+    assert set(np.unique(read_label(tmp_path / "capture" / "masks" / "0.png"))) == {0, 2}
+    assert validate(tmp_path / "capture").facts["masks"] == COUNT
+    with pytest.raises(OutputExistsError):
+        mask(tmp_path / "capture", tmp_path / "capture" / "masks", body="b")
+    assert mask(tmp_path / "capture", tmp_path / "capture" / "masks", body="a", overwrite=True).label == 1
+
+
+def test_what_cannot_be_done_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    photos = folder(tmp_path / "photos", scene("what moves")[0])
+    (tmp_path / "empty").mkdir()
+    out = tmp_path / "masks"
+    for call, error, text in (
+        (lambda: mask(photos, out), InputDataError, "the photos do not tell the body"),
+        (lambda: mask(photos, out, (10, 10, 130, 60)), UsageError, "not inside 0.png, which has 120 x 90 pixels"),
+        (lambda: mask(photos, out, (10, 60, 50, 60)), UsageError, "not inside 0.png"),
+        (lambda: mask(photos, out, BOX, "9.png"), UsageError, "--photo 9.png: no such photo"),
+        (lambda: mask(photos, out, BOX, body="a"), UsageError, "--body a: no such body"),
+        (lambda: mask(tmp_path / "empty", out), InputDataError, "no photos"),
+        (lambda: mask(tmp_path / "none", out), InputDataError, "none"),
+    ):
+        with pytest.raises(error, match=text):
+            call()
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["empty", "photos"]
+
+
+def test_a_body_that_is_lost_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos = folder(tmp_path / "photos", scene("what moves")[0])
+    nothing = [np.zeros((HEIGHT, WIDTH), bool)] * 4 + [np.ones((HEIGHT, WIDTH), bool)] * 2
+    monkeypatch.setattr("cgwm.pipeline.mask.stage.from_box", lambda *_: nothing)
+    with pytest.raises(NotConvergedError, match=r"found in 2 of 6 photos"):
+        mask(photos, tmp_path / "masks", BOX)
+    assert not (tmp_path / "masks").exists()
+
+
+def test_doubtful_masks_are_named() -> None:
+    disc = cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), (60, 45), 20, 1, cv2.FILLED) > 0
+    large = cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), (60, 45), 30, 1, cv2.FILLED) > 0
+    cut_off = np.roll(disc, 50, axis=1) & (np.arange(WIDTH) > 30)
+    assert doubts([disc] * 4) == [""] * 4
+    said = doubts([disc, disc, disc, large, disc, np.zeros_like(disc), cut_off])
+    assert [bool(one) for one in said] == [False, False, False, True, False, True, True]
+    assert said[3].startswith("the body has 2.2 times the size")
+    assert said[5] == "nothing of the body was found" and "border" in said[6]
+    assert doubts([disc]) == [""]
+
+
+def test_changed_masks_are_faults(tmp_path: Path) -> None:
+    mask(folder(tmp_path / "photos", scene("one colour")[0]), tmp_path / "masks")
+    (tmp_path / "masks" / "0.png").unlink()
+    write_image(tmp_path / "masks" / "1.png", np.full((HEIGHT, WIDTH), 3, np.uint8))
+    write_image(tmp_path / "masks" / "2.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    faults = validate(tmp_path / "masks").faults
+    assert [text in fault for text, fault in zip(("missing", "has label 3", "fills 0.0 %"), faults, strict=True)] == [
+        True
+    ] * 3
+    listed = json.loads((tmp_path / "masks" / "masks.json").read_text())["photos"]
+    assert all(a < b for a, b in pairwise(listed))
