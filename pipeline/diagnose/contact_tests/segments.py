@@ -77,7 +77,8 @@ class SegmentsTest(ContactTest):
         best, sliding = equals[0], data.earlier.get("sliding", ())
         if best.candidate.effect.phase != "contact" and not data.explained:  # flights, which show it too, do not fit
             return (Bar(score=self.limits.alone_score, gain_t=self.limits.gain_t),)
-        if best.candidate.effect.phase != "contact" or best.name in self.limits.in_impacts_alone:
+        unseen = (*self.limits.in_impacts_alone, *self.limits.hidden_in_slides)
+        if best.candidate.effect.phase != "contact" or best.name in unseen:
             return (Bar(score=self.limits.score, gain_t=self.limits.gain_t),)
         if not sliding:
             return (Bar(score=self.limits.alone_score, gain_t=self.limits.gain_t),)
