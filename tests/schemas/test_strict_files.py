@@ -28,6 +28,7 @@ from cgwm.schemas import (
     read_plan,
     read_toml,
 )
+from cgwm.schemas.base import _in_document
 from cgwm.schemas.diagnose import ThrowsFile
 from cgwm.schemas.documents import MAX_DEPTH, parse_json, parse_toml
 from cgwm.schemas.plan import RejectionRules
@@ -362,3 +363,25 @@ def test_a_plan_to_edit_explains_each_rule_and_a_short_one_nothing() -> None:
     for name, field in RejectionRules.model_fields.items():
         assert f"# {' '.join(str(field.description).split())}" in text and name in text
     assert "#" not in short and tomllib.loads(short) is not None
+
+
+@pytest.mark.parametrize(("wrong", "said"), [(1, "correct the field."), (3, "correct the field (2 more to correct).")])
+def test_the_first_fault_is_told_and_the_others_are_counted(wrong: int, said: str) -> None:
+    text = CAPTURE
+    for name in ("mass_kg = 0.37", "position_std_m = 0.001", "frame_rate_hz = 30.0")[:wrong]:
+        text = text.replace(name, name.partition(" = ")[0] + ' = "none"')
+    with pytest.raises(InputDataError) as refused:
+        parse(tomllib.loads(text), CaptureManifest, "capture.toml", text)
+    assert str(refused.value).endswith(f"Next: {said}") and "mass_kg" in str(refused.value)
+
+
+def test_branches_of_a_union_are_no_part_of_a_place_in_a_document() -> None:
+    data = {"shape": {"size": 3, "parts": [1]}}
+    for location, kept in (
+        (("shape", "BoxShape", "size"), ("shape", "size")),
+        (("shape", "function-after[f(), Box]"), ("shape",)),
+        (("shape", "height_m"), ("shape", "height_m")),
+        (("shape", "parts", 1), ("shape", "parts", 1)),
+        (("shape", "parts", 1, "tagged-union[x]"), ("shape", "parts")),
+    ):
+        assert _in_document(location, data) == kept

@@ -69,6 +69,18 @@ def tosses(count: int, weighted: bool = True, drag_per_s: float = 0.0) -> list[E
     return episodes
 
 
+def test_the_centre_of_mass_stays_within_half_of_the_body() -> None:
+    *centre, x, y, z = mass_distribution("cube", 0.2)
+    assert [p.name for p in (*centre, x, y, z)] == [
+        *(f"cube.com_{axis}_m" for axis in "xyz"),
+        *(f"cube.moment_{axis}" for axis in "xyz"),
+    ]
+    for parameter in centre:
+        assert parameter.bounds == pytest.approx((-0.1, 0.1)) and parameter.prior == pytest.approx((0.0, 0.05))
+    for parameter in (x, y, z):  # ten times either way, on a logarithmic scale about what the shape says
+        assert parameter.logarithmic and parameter.bounds == (0.1, 10.0) and parameter.prior == (1.0, 0.5)
+
+
 def test_second_moments_scale_as_those_of_a_stretched_box() -> None:
     """A box that is s times longer along x, at equal mass, has s^2 times the second moment along x and no other."""
     short, long = box_body((0.05, 0.04, 0.03)), box_body((0.10, 0.04, 0.03))

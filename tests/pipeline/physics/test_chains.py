@@ -485,3 +485,9 @@ def test_priors_of_a_chain_scale_with_its_weight_and_factors_are_as_free_upwards
         assert light[name].bounds[0] < light[name].prior[0] < light[name].bounds[1]
     for name in ("lower.mass_factor", "arm.inertia_factor"):
         assert light[name].prior[0] == 1.0 and light[name].bounds[0] * light[name].bounds[1] == pytest.approx(1.0)
+
+
+def test_frames_and_axes_of_joints_need_not_have_unit_length() -> None:
+    joint = Joint.of("j", "hinge", "link", "base", quat_wxyz=(3.0, 0, 4.0, 0), axis=(0, 0, 2.0))
+    torch.testing.assert_close(joint.quat_wxyz, torch.tensor([[0.6, 0, 0.8, 0]]).to(joint.quat_wxyz))
+    torch.testing.assert_close(joint.axis, torch.tensor([[0, 0, 1.0]]).to(joint.axis))

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from cgwm.pipeline.physics.hull import Hull, hull_distance
 from cgwm.pipeline.physics.impulse_solver import tangent_axes
 from cgwm.pipeline.physics.rollout import require_finite
 from cgwm.pipeline.physics.rollout_cost import rollout_part, rollout_seconds
-from cgwm.pipeline.physics.smooth_distance import plane_contacts
+from cgwm.pipeline.physics.smooth_distance import blended, plane_contacts, smooth_min
 from cgwm.pipeline.physics.world import Body
 from cgwm.schemas import NotConvergedError
 from helpers.worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
@@ -159,3 +160,15 @@ def test_a_large_sphere_that_protrudes_from_a_face_has_no_edges() -> None:
 def test_spheres_in_one_plane_have_no_hull() -> None:
     centers = batch([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [1.0, 1.0, 0]])[0]
     assert Hull.of(centers, torch.full((4,), 0.1, dtype=F64), torch.arange(4)) is None
+
+
+def test_the_normal_between_opposite_spheres_is_a_unit_vector() -> None:
+    offset = torch.tensor([[[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]]], dtype=torch.float64)
+    radii = torch.full((1, 2), 0.05, dtype=torch.float64)
+    distance, normal = blended(offset, radii, partial(smooth_min, width=0.01))
+    assert normal.tolist() == [[0.0, 0.0, 1.0]] and 0.03 < float(distance) <= 0.05
+
+
+def test_bodies_surfaces_and_the_ground_are_named() -> None:
+    world = world_of(box_body(), ball_body(0.04, name="ball"))
+    assert [world.named(k) for k in (-1, 0, 1)] == ["the ground", "body 'box'", "body 'ball'"]

@@ -6,8 +6,10 @@ from cgwm.pipeline.rendering.contact_sheets import (
     FrameStrip,
     _outline,
     _window,
+    compared,
     label_colors,
     small_png,
+    telling,
 )
 
 
@@ -44,3 +46,34 @@ def test_a_small_picture_keeps_its_brightness() -> None:
     found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert len(data) <= 5000 and found is not None
     assert abs(float(found.mean()) - float(image.mean())) < 3
+
+
+def test_noise_becomes_a_smaller_picture_of_the_same_shape() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (60, 90, 3), dtype=np.uint8)
+    data = small_png(noise, 2000)
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert len(data) <= 2000 and found is not None
+    assert 20 < found.shape[1] < 90 and abs(found.shape[1] / found.shape[0] - 1.5) < 0.1
+
+
+def test_errors_are_means_of_the_channels_in_tiles_with_margins() -> None:
+    photos = [np.zeros((30, 40, 3), np.uint8), np.zeros((40, 20, 3), np.uint8)]
+    renders = [photo.copy() for photo in photos]
+    renders[1][..., 2] = 96  # 32 on average, half of what saturates
+    sheet = compared(photos, renders, width=40)
+    assert sheet.shape == (3 * 30 + 8, 2 * 40 + 4, 3)
+    error = sheet[-30:, 44:]
+    magma = cv2.applyColorMap(np.full((1, 1), 128, np.uint8), cv2.COLORMAP_MAGMA)[0, 0, ::-1]
+    assert (error[:, 12:27] == magma).all()  # 15 of 40 pixels wide, as 20 of 40 are at a height of 30
+    assert (error[:, :12] == 255).all() and (error[:, 27:] == 255).all()
+
+
+def test_frames_are_chosen_where_the_object_moves() -> None:
+    masks = np.zeros((12, 20, 60), np.uint8)
+    for k in range(12):
+        left = 4 * max(0, k - 6)
+        masks[k, 5:15, left : left + 10] = 1
+    frames = np.zeros((12, 20, 60, 3), np.uint8)
+    strip = FrameStrip(episode="a", camera="c", times_s=np.arange(12.0), real=frames, predicted=frames, masks=masks)
+    chosen = telling(strip, 5)
+    assert chosen[0] == 0 and chosen[-1] == 11 and sum(k > 6 for k in chosen) >= 3

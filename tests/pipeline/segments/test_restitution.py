@@ -11,8 +11,10 @@ from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.phys_geo.tracks.contact_fit import RestitutionFit, damping_of, restitution_of
 from cgwm.pipeline.physics.contact_law import restitution
 from cgwm.pipeline.segments.bounces import BounceSide, _turns
+from cgwm.pipeline.segments.impact_law import changes_rebound
 from cgwm.pipeline.segments.restitution_fit import DRAG_PRIOR, SHAKEN_S, _Flight, _Flights, _Noise, _Solved
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
+from helpers.diagnosis_data import world_with
 from helpers.worlds import ball_body, world_of
 
 RADIUS_M, GRAVITY_M_S2, STEP_S = 0.02, 9.81, 1e-3
@@ -144,3 +146,16 @@ def test_thinned_frames_keep_both_ends_and_a_ball_that_stays_down_does_not_bounc
     assert _turns(side) == []
     rising = replace(side, height_m=np.where(time > 0.041, 0.012 + 0.8 * (time - 0.04), fall))
     assert _turns(rising) == [4]
+
+
+@pytest.mark.parametrize(
+    ("effects", "changed"),
+    [
+        ({}, False),
+        ({"velocity_restitution": {"r": 0.2}}, True),
+        ({"adhesion": {"F": 1.0}}, True),
+        ({"anisotropic_friction": {"a": 0.1}}, False),
+    ],
+)
+def test_effects_that_change_a_rebound_are_told_from_those_of_friction(effects: dict, changed: bool) -> None:
+    assert changes_rebound(world_with("ball", effects)) is changed
