@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,10 +16,12 @@ from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.geometry.rotation import quat_multiply, quat_to_matrix
 from cgwm.pipeline.physics import World
-from cgwm.pipeline.segments.input_checks import check_observability, check_units_and_geometry
+from cgwm.pipeline.segments.input_checks import LIMITS, _travel, check_observability, check_units_and_geometry
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.trajectories.initial_state import clearance
+from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
+from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import InputDataError
 from helpers.diagnosis_data import NOISE, tosses, world_with, write_capture
 from scipy.signal import savgol_filter
@@ -200,3 +203,21 @@ def test_the_largest_moment_of_inertia_has_to_fit_into_the_shape() -> None:
         else:
             with pytest.raises(InputDataError, match="moments of inertia"):
                 check_units_and_geometry(other, tosses(world, 3, count=1, duration_s=0.3), "capture")
+
+
+def test_a_motion_within_the_noise_is_none() -> None:
+    """The spread of a coordinate within an episode is compared with a multiple of the noise."""
+    times, rng = np.arange(0, 0.4, 0.01), np.random.default_rng(0)
+    episodes = [(str(k), {"ball": Track(times, rng.normal(0, 0.01, (40, 3)), None)}) for k in range(3)]
+    world = world_with("ball", ground=False)
+    whole = Observations.of(world, episodes, [(-np.inf, np.inf)] * 3)
+    spread = _travel(whole)
+
+    def checked(sigma: float) -> None:
+        noise = Noise(sigma, 0.1)
+        prepared = SimpleNamespace(observations=whole, noise=noise, least_force_m_s2=0.0)
+        check_observability(world, prepared, "here")
+
+    with pytest.raises(InputDataError, match="nothing moves by more than"):
+        checked(spread / (0.8 * LIMITS.alike_sigmas))
+    checked(spread / (1.5 * LIMITS.alike_sigmas))

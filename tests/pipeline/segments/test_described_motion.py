@@ -7,7 +7,7 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics.world import Body, World
-from cgwm.pipeline.segments.described_motion import not_described
+from cgwm.pipeline.segments.described_motion import _sentence, _supported, not_described
 from cgwm.pipeline.trajectories.initial_state import clearance
 from cgwm.pipeline.trajectories.observations import Observations
 from helpers.diagnosis_data import NOISE, tosses, world_with
@@ -72,3 +72,27 @@ def row_of_spheres(apart_m: float) -> Body:
     place = batch((0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
     radii = torch.full((1, len(along)), 0.01, dtype=torch.float64)
     return replace(like, name="rail", motion="fixed", centers=centers, radii=radii, place=place)
+
+
+def test_heights_that_stay_level_or_turn_at_once_show_a_support() -> None:
+    times = torch.arange(0, 0.6, 0.01, dtype=torch.float64)
+    falling = 3 * times - 4.905 * times**2
+    assert not _supported(times, falling, 9.81) and not _supported(times[:3], 0 * times[:3], 9.81)
+    assert _supported(times, 0 * times, 9.81)
+    bounce = 2 * (times - 0.3).abs()
+    assert _supported(times, bounce, 9.81)
+    assert not _supported(times, -bounce, 9.81)  # turns from rising to falling
+    assert not _supported(times, 3 * times + 5 * times**2, 9.81)  # rises ever faster
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ((0.5, 0.1, "still", 0), "it is 0.5 m off, a body that stands still 0.1 m"),
+        ((np.inf, 0.2, "steady", 0), "its rollout diverges, a body that keeps its velocity 0.2 m"),
+        ((0.5, 0.1, None, 3), "nothing touches anything in it, while the tracks show contact in 3 of the episodes"),
+    ],
+)
+def test_the_sentence_says_what_describes_the_motion_better(numbers: tuple, said: str) -> None:
+    sentence = _sentence(*numbers, "a wrong ground")
+    assert sentence == f"The model does not describe this motion: {said}. Likely cause: a wrong ground."

@@ -13,7 +13,7 @@ from cgwm.pipeline.phys_geo.effects import requested_effects
 from cgwm.pipeline.phys_geo.tracks.contact_result import PhysicsFit
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.segments.prepare import prepare
-from cgwm.pipeline.segments.release_detection import after_release, find_releases
+from cgwm.pipeline.segments.release_detection import _rotation_chi2, after_release, find_releases
 from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.diagnosis_data import tosses, world_with
@@ -113,3 +113,11 @@ def test_a_hand_hides_neither_another_one_nor_a_wrong_frame() -> None:
     assert list(prepared.released_s) == ["002"] and prepared.outliers == 1
     assert not bool(prepared.observations.has_orientation[4, 20]) and bool(prepared.observations.has_orientation[4, 19])
     assert np.allclose(prepared.noise, NOISE, rtol=0.15)
+
+
+def test_rotations_of_flights_have_a_reduced_chi_square_of_one() -> None:
+    world = world_with("cube")
+    prepared = prepare(world, thrown(world), NOISE)
+    assert prepared.flight is not None
+    found = _rotation_chi2(prepared.flight)
+    assert len(found) == 6 and 0.8 < float(found.mean()) < 1.25

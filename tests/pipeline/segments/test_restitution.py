@@ -12,7 +12,17 @@ from cgwm.pipeline.phys_geo.tracks.contact_fit import RestitutionFit, damping_of
 from cgwm.pipeline.physics.contact_law import restitution
 from cgwm.pipeline.segments.bounces import BounceSide, _turns
 from cgwm.pipeline.segments.impact_law import changes_rebound
-from cgwm.pipeline.segments.restitution_fit import DRAG_PRIOR, SHAKEN_S, _Flight, _Flights, _Noise, _Solved
+from cgwm.pipeline.segments.restitution_fit import (
+    CONTACT_PRIOR,
+    DRAG_PRIOR,
+    SHAKEN_S,
+    _Flight,
+    _Flights,
+    _ground,
+    _Noise,
+    _Solved,
+    _Speeds,
+)
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from helpers.diagnosis_data import world_with
 from helpers.worlds import ball_body, world_of
@@ -159,3 +169,39 @@ def test_thinned_frames_keep_both_ends_and_a_ball_that_stays_down_does_not_bounc
 )
 def test_effects_that_change_a_rebound_are_told_from_those_of_friction(effects: dict, changed: bool) -> None:
     assert changes_rebound(world_with("ball", effects)) is changed
+
+
+def test_drag_of_a_vertical_flight_is_the_integral_of_the_square_of_its_speed() -> None:
+    """Up all the time, at u - g t: k D(t) is twice the integral of -k (u - g t)^2; nothing moves sideways."""
+    t, u = np.linspace(0.0, 0.3, 31), 4.0
+    height = u * t - 0.5 * GRAVITY_M_S2 * t**2
+    side = BounceSide(time_s=t, height_m=height, position_m=np.outer(height, [0.0, 0.0, 1.0]))
+    known = -(u**2 * t**2 / 2 - u * GRAVITY_M_S2 * t**3 / 3 + GRAVITY_M_S2**2 * t**4 / 12)
+    np.testing.assert_allclose(_Flight.of(side, GRAVITY_M_S2).drag, known, atol=1e-3 * abs(known[-1]))
+    sideways = replace(side, position_m=np.column_stack([3.0 * t, 0 * t, height]))  # more drag, as it is faster
+    assert _Flight.of(sideways, GRAVITY_M_S2).drag[-1] < 1.1 * known[-1]
+
+
+def test_flights_meet_under_the_ground_by_what_the_contact_takes() -> None:
+    """Two flights of speeds a and b meet a b / (a + b) T under the ground; slow and fast bounces tell both apart."""
+    ground, contact_s = 0.003, 1.5 * CONTACT_PRIOR[0]
+    fall, rise = np.array([1.0, 2.0, 4.0]), np.array([0.8, 1.5, 2.5])
+    meet = ground - fall * rise / (fall + rise) * contact_s
+    states = np.stack([np.stack([meet, -fall], -1), np.stack([meet, rise], -1)], 1)
+    height, found_s, variance = _ground(states, np.tile(1e-12 * np.eye(2), (3, 2, 1, 1)))
+    assert height == pytest.approx(ground, abs=2e-5) and found_s == pytest.approx(contact_s, rel=0.01)
+    assert 0 < variance < 1e-6
+
+
+def test_an_error_that_both_speeds_share_is_none_of_their_ratio() -> None:
+    """The first bounce has its two speeds wrong by one factor, the second each on its own: the first tells more."""
+    speeds = np.array([[2.0, 1.6], [2.0, 1.2]])
+    covariance = np.zeros((4, 4))
+    covariance[:2, :2] = 0.2**2 * np.outer(speeds[0], speeds[0])
+    covariance[2:, 2:] = 0.2**2 * np.diag(speeds[1] ** 2)
+    measured = _Speeds(speeds=speeds, covariance=covariance, contacts=[], drag=0.0)
+    noise = _Noise(white_m=1e-3, slow_m=1e-3, time_s=0.05, lift_m_s2=0.1, shaken_m=1e-3)
+    found = measured.restitution(noise, degrees=10)
+    assert found.own.tolist() == [0.8, 0.6] and found.own_std[0] < 1e-6
+    assert found.own_std[1] == pytest.approx(0.6 * 0.2 * 2**0.5)
+    assert found.estimate > 0.75
