@@ -28,6 +28,14 @@ def test_the_conda_recipe_asks_for_what_the_project_asks_for() -> None:
     assert f'version: "{PROJECT["project"]["version"]}"' in recipe
 
 
+@pytest.mark.evidence
+def test_the_conda_recipe_renders() -> None:
+    rattler = pytest.importorskip("rattler_build", reason="reads recipes: pip install py-rattler-build")
+    recipe = rattler.Stage0Recipe.from_file(ROOT / "packaging/conda/recipe.yaml")
+    (found,) = recipe.render(rattler.VariantConfig())
+    assert str(found.recipe.package.name) == "cgwm"
+
+
 def test_the_dockerfile_copies_every_package() -> None:
     text = (ROOT / "packaging/Dockerfile").read_text(encoding="utf-8")
     for folder in PROJECT["tool"]["setuptools"]["package-dir"].values():

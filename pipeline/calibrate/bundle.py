@@ -50,7 +50,9 @@ class NormalEquations:
         blocks = self.points + damping * self.points * np.eye(3)
         trace = np.trace(self.points, axis1=1, axis2=2)[:, None, None]
         blocks = blocks + (_RIDGE * trace + np.finfo(float).tiny) * np.eye(3)
-        inverse = sparse.block_diag(list(np.linalg.inv(blocks)), format="csr")
+        count = len(blocks)
+        places = (np.arange(count), np.arange(count + 1))
+        inverse = sparse.bsr_array((np.linalg.inv(blocks), *places), shape=(3 * count, 3 * count)).tocsr()
         matrix = self.matrix - (self.coupling @ inverse @ self.coupling.T).toarray()
         right = self.right - self.coupling @ (inverse @ self.points_right.ravel())
         return ReducedEquations(self, matrix, right, sparse.csr_array(inverse))

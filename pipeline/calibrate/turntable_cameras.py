@@ -18,9 +18,11 @@ from .turntable_places import with_places
 
 _KEEP_WITHIN = (4.0, 3.0)
 """As in `mapping`: residuals above this many standard deviations are taken for wrong matches, in turn."""
-_COARSE_STEPS, _FINE_STEPS = 12, 40
 _WORSE = 1.5
 """Most by which the noise of the matches may grow with the photos that are placed on the rings."""
+_COARSE_STEPS, _FINE_STEPS = 12, 40
+_FAR = 40.0
+"""Errors with the motion nearest to the poses, in units of those of free cameras, above which none is tried."""
 
 
 Lenses = Map[str, Map[str, str]]
@@ -78,10 +80,12 @@ def _constrained(model: SfmModel, lenses: Lenses, focals: Focals) -> TurntableCa
     turned, motion = start
     # from afar, under a loss as wide as the start is wrong
     wide = noise_px(_lengths(replace(turned, T_cam_world={k: motion.poses()[k] for k in turned.T_cam_world})))
+    if wide > _FAR * noise:
+        return None
     richest = _present(lenses[list(lenses)[-1]], turned)
-    for scale, steps in ((wide, _COARSE_STEPS), (noise, _FINE_STEPS)):
-        weights = _weights(turned, richest, focals, noise)
-        turned, motion = adjusted(turned, motion, richest, LOSS_SCALE * scale, weights, steps)
+    weights = _weights(turned, richest, focals, noise)
+    turned, motion = adjusted(turned, motion, richest, LOSS_SCALE * wide, weights, _COARSE_STEPS)
+    turned, motion = adjusted(turned, motion, richest, LOSS_SCALE * noise, weights, _FINE_STEPS)
     if _beaten(turned, motion, free, noise):
         return None
     return _with_lens(turned, motion, lenses, focals)

@@ -173,6 +173,21 @@ def test_a_walk_gives_sharp_frames_at_equal_distances(tmp_path: Path) -> None:
     assert read_rgb(tmp_path / "out/images" / f"{numbers[0]:06d}.jpg").shape == (240, 320, 3)
 
 
+def test_a_video_of_a_phone_in_hevc_is_read(tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="makes the video: pip install av")
+    if "libx265" not in av.codecs_available:
+        pytest.skip("this build of av writes no HEVC")
+    write_walk(tmp_path / "plain.mp4", 8)
+    source = cv2.VideoCapture(str(tmp_path / "plain.mp4"))
+    with av.open(str(tmp_path / "walk.mov"), "w") as container:
+        stream = container.add_stream("libx265", rate=30, options={"preset": "ultrafast", "log-level": "none"})
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        while (read := source.read())[0]:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(read[1], format="bgr24")))
+        container.mux(stream.encode())
+    assert import_video(tmp_path / "walk.mov", tmp_path / "out", photos=3).photos == 3
+
+
 def test_a_rotated_video_is_turned_upright(tmp_path: Path) -> None:
     write_walk(tmp_path / "walk.mp4", 12)
     data = bytearray((tmp_path / "walk.mp4").read_bytes())

@@ -104,7 +104,7 @@ def test_a_turntable_is_found_in_any_frame_and_adjusted_to_the_truth() -> None:
 
 
 def test_a_carried_camera_is_not_on_a_turntable() -> None:
-    poses = truth(jitter=0.01)
+    poses = truth(jitter=0.002)
     model, pairs = observed(poses)
     assert turntable_motion(model) is not None  # near enough to be tried
     assert on_turntable([model], pairs, cameras_of(poses), LENSES, {}) is None
