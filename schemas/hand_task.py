@@ -120,8 +120,8 @@ class HandPlannerSection(PlannerSection):
     """Pieces of a plan, in which the targets change at constant speed."""
     samples: Samples = 64
     """Sequences of commands that are compared for a plan."""
-    step_s: Step = 0.02
-    """Largest time step of a prediction [s]."""
+    step_s: Step = 0.01
+    """Largest time step of a prediction [s]; contacts are softened to it."""
 
 
 class HandSuccessSection(TaskSection):

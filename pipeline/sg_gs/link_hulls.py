@@ -16,8 +16,8 @@ from .link_spheres import mesh_of_part
 
 Array = NDArray[np.float64]
 Balls = tuple[Array, Array]
-ROUNDING_M = 0.002
-"""Largest radius of the balls, by which corners are rounded [m]."""
+ROUNDING_M = 0.0005
+"""Largest radius of the balls, by which corners are rounded [m]: fingers hold an object by their edges."""
 _SHARE = 0.25
 """Largest radius in units of the smallest extent of a shape."""
 _DIRECTIONS = 600

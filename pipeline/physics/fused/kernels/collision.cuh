@@ -479,8 +479,14 @@ __device__ int touch_pair(const Problem& problem, Environment& env, int p, const
         const Number margin = Number(1 + 1e-5) * (limit + Number(SMOOTHING_M));
         if (boxes_apart(cb, ca, frames[0], margin) || boxes_apart(ca, cb, frames[1], margin)) end = 0;
 #if HULLS
-        // nothing of one hull is nearer to the other one than the gap along the normal that parts them best
-        if (end > 0 && part(problem, env, p, rotations, limit, parting) && parting.gap > limit) end = 0;
+        // nothing of one hull is nearer to the other one than the gap along any axis
+        Number* parted = env.parted[p];
+        const bool known = parted[0] != Number(0) || parted[1] != Number(0) || parted[2] != Number(0);
+        if (end > 0 && known && gap_along(problem, env, a, b, rotations, parted) > limit) end = 0;
+        if (end > 0 && part(problem, env, p, rotations, limit, parting) && parting.gap > limit) {
+            for (int k = 0; k < 3; k++) parted[k] = parting.axis[k];
+            end = 0;
+        }
 #endif
 #if LINKS
         if (end > 0) {

@@ -90,6 +90,9 @@ struct Environment {
 #if PAIRED
     int kept[SLOTS], kept_count;  // the slots that may not be zero
 #endif
+#if HULLS
+    Number parted[PAIR_ROOM][3];  // of each pair, an axis that parted its hulls in an earlier step; zero for none
+#endif
 #if RECORD
     Tally tallies[SLOTS];
 #endif
@@ -192,6 +195,11 @@ INLINE void load(const Problem& problem, Environment& env) {
     env.warm = false;
 #if PAIRED
     env.kept_count = 0;
+#endif
+#if HULLS
+    for (int p = 0; p < PAIRS; p++) {
+        for (int k = 0; k < 3; k++) env.parted[p][k] = Number(0);
+    }
 #endif
 #if HELD
     EACH_SLOT

@@ -1,0 +1,192 @@
+"""How far predictions of a cube in a LEAP hand are from MuJoCo, by shapes of the links and steps.
+
+python benchmarks/hand_forecast.py --scene FOLDER [--seeds 200,201] [--seconds 15]
+
+FOLDER as for `hand.py`. cgwm's controller turns the cube in the scene `xml/leap_cube_sim.xml` without a clock. From
+every third of the states that occur, the commands that followed are applied again in the predicting model. Given are
+medians over states of distance and turn between its cube and that of the scene after 0.1, 0.25 and 0.5 s, and CPU time
+a step. `still` is a cube that stays; `MuJoCo, 10 ms` is the scene in which judo plans, `xml/leap_cube.xml`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import hand
+import mujoco
+import numpy as np
+import torch
+from cgwm.pipeline.control.hand_controller import HandController
+from cgwm.pipeline.control.hand_loop import goals_of
+from cgwm.pipeline.control.hand_objective import turn_to
+from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
+from cgwm.pipeline.control.horizon import Array
+from cgwm.pipeline.physics.engine import rollout
+from cgwm.pipeline.physics.joint_command import JointCommand
+from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.sg_gs import link_hulls
+from cgwm.schemas import HandTask
+
+INTERVAL_S, AHEAD, EVERY = 0.05, 10, 3
+CHECKED = (2, 5, 10)
+"""Commands after the start at which predictions are compared."""
+COMPARED = (
+    (0.002, 16, 0.02), (0.0005, 16, 0.02), (0.0005, 16, 0.01), (0.0005, 16, 0.005), (0.0005, 48, 0.005),
+    (0.0005, 16, 0.002),
+)  # fmt: skip
+"""Radius by which corners are rounded [m], corners of a link, and step [s] of the predictions compared."""
+Motion = tuple[Array, Array]
+"""Positions (starts, AHEAD + 1, 3) [m] and orientations (starts, AHEAD + 1, 4) of the cube."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """A state from which predictions start."""
+
+    truths: list[HandTruth]
+    """True states at the start and after each command."""
+    targets_rad: Array
+    """Targets before the start and at the end of each command, shape (AHEAD + 1, joints)."""
+
+
+def task_of(folder: str, scene: Path, corners: int, step_s: float) -> HandTask:
+    """Return the task of `hand.py` with plans of 64 samples over 0.5 s."""
+    given = argparse.Namespace(corners=corners, hz=1 / INTERVAL_S, samples=64, horizon=0.5, step=step_s, seconds=60.0)
+    return hand.task_in(Path(folder), scene, given)
+
+
+def moments_of(scene: Path, seed: int, seconds: float) -> Iterator[Moment]:
+    """Yield the starts of one run of the controller."""
+    with tempfile.TemporaryDirectory() as folder:
+        controller = HandController(hand.cube(), task_of(folder, scene, 16, 0.005))
+        plant, goals = HandScenePlant(controller.hand), goals_of(controller.task, seed)
+        truths, targets = [plant.reset(np.array(hand.PLACE_M), np.array([1.0, 0, 0, 0]))], [controller.hand.home]
+        controller.restart(seed)
+        goal = next(goals)
+        controller.aim(goal)
+        for number in range(round(seconds / INTERVAL_S)):
+            now = truths[-1]
+            command = controller.command(now.measured(INTERVAL_S * number, now.position_m, now.quat_wxyz))
+            targets.append(np.array([command[name] for name in controller.joints]))
+            truths.append(plant.advance(targets[-1], INTERVAL_S))
+            if np.linalg.norm(truths[-1].position_m - hand.PLACE_M) > controller.task.success.drop_m:
+                break
+            if _turn_deg(truths[-1].quat_wxyz, goal) < controller.task.success.turn_deg:
+                goal = next(goals)
+                controller.aim(goal)
+    for k in range(2, len(truths) - AHEAD, EVERY):
+        yield Moment(truths=truths[k : k + AHEAD + 1], targets_rad=np.stack(targets[k : k + AHEAD + 1]))
+
+
+def still(moments: list[Moment]) -> Motion:
+    """Return the motion of a cube that stays."""
+    starts = [moment.truths[0] for moment in moments]
+    places = (np.stack([start.position_m for start in starts]), np.stack([start.quat_wxyz for start in starts]))
+    position, quat = (np.repeat(values[:, None], AHEAD + 1, 1) for values in places)
+    return position, quat
+
+
+def predicted(moments: list[Moment], scene: Path, corners: int, step_s: float) -> Motion:
+    """Return what cgwm predicts."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = HandController(hand.cube(), task_of(folder, scene, corners, step_s)).hand
+        starts = [
+            moment.truths[0].measured(0.0, moment.truths[0].position_m, moment.truths[0].quat_wxyz)
+            for moment in moments
+        ]
+        states = [
+            found.state(
+                x.position_m, x.quat_wxyz, x.joints, _given(x.velocity_m_s), _given(x.omega_body_rad_s), x.joint_speeds
+            )
+            for x in starts
+        ]
+        state = State(*(torch.cat(parts) for parts in zip(*(one.tensors for one in states), strict=True)))
+        times = INTERVAL_S * torch.arange(AHEAD + 1, dtype=torch.float64)
+        knots = torch.as_tensor(np.stack([moment.targets_rad for moment in moments]))
+        motion = rollout(found.planning(), state, times, {found.chain.name: JointCommand.targets(times[None], knots)})
+    return motion.position_m[:, :, found.object].numpy(), motion.quat_wxyz[:, :, found.object].numpy()
+
+
+def simulated(moments: list[Moment], path: Path) -> Motion:
+    """Return what a scene of MuJoCo predicts."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    names = [model.joint(name).id for name in moments[0].truths[0].names]
+    places, speeds = model.jnt_qposadr[names], model.jnt_dofadr[names]
+    servos = [next(k for k in range(model.nu) if model.actuator_trnid[k, 0] == name) for name in names]
+    joint = model.body_jntadr[model.body("cube").id]
+    first, moving = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+    steps = round(INTERVAL_S / model.opt.timestep)
+    poses = []
+    for moment in moments:
+        start = moment.truths[0]
+        mujoco.mj_resetData(model, data)
+        data.qpos[places], data.qvel[speeds] = start.joints_rad, start.speeds_rad_s
+        data.qpos[first : first + 7] = [*start.position_m, *start.quat_wxyz]
+        data.qvel[moving : moving + 6] = [*start.velocity_m_s, *start.omega_body_rad_s]
+        poses.append(data.qpos[first : first + 7].copy())
+        for before, after in zip(moment.targets_rad[:-1], moment.targets_rad[1:], strict=True):
+            for step in range(1, steps + 1):
+                data.ctrl[servos] = before + (after - before) * step / steps
+                mujoco.mj_step(model, data)
+            poses.append(data.qpos[first : first + 7].copy())
+    found = np.stack(poses).reshape(len(moments), AHEAD + 1, 7)
+    return found[..., :3], found[..., 3:]
+
+
+def row(name: str, moments: list[Moment], predict: Callable[[], Motion], step_s: float | None) -> list[str]:
+    """Return a row of the table."""
+    begun = time.process_time()
+    position, quat = predict()
+    spent = time.process_time() - begun
+    cells = [name]
+    for ahead in CHECKED:
+        away = [np.linalg.norm(x[ahead] - m.truths[ahead].position_m) for x, m in zip(position, moments, strict=True)]
+        turned = [_turn_deg(x[ahead], m.truths[ahead].quat_wxyz) for x, m in zip(quat, moments, strict=True)]
+        cells.append(f"{1e3 * np.median(away):.1f} mm, {np.median(turned):.1f} deg")
+    steps = len(moments) * AHEAD * INTERVAL_S / step_s if step_s else math.inf
+    return [*cells, f"{1e6 * spent / steps:.0f} us"]
+
+
+def _turn_deg(quat_wxyz: Array, goal_wxyz: Array) -> float:
+    return math.degrees(float(turn_to(torch.as_tensor(quat_wxyz)[None], torch.as_tensor(goal_wxyz)).norm()))
+
+
+def _given(values: Array | None) -> Array:
+    assert values is not None  # the plant measures them
+    return values
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, required=True, help="judo/models of judo-rai 0.1.0, with meshes/leap/")
+    parser.add_argument("--seeds", default="200,201")
+    parser.add_argument("--seconds", type=float, default=15.0, help="length of a run")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    scene = given.scene.resolve()
+    moments = [found for seed in given.seeds.split(",") for found in moments_of(scene, int(seed), given.seconds)]
+    print(f"{len(moments)} states\n\n| | 0.1 s | 0.25 s | 0.5 s | a step, CPU |\n| --- | --- | --- | --- | --- |")
+    print(f"| {' | '.join(row('still', moments, lambda: still(moments), None))} |")
+    predicted(moments[:1], scene, 16, 0.005)  # compiles
+    usual = link_hulls.ROUNDING_M
+    for rounding, corners, step_s in COMPARED:
+        link_hulls.ROUNDING_M = rounding
+        name = f"cgwm, {corners} corners rounded by {1e3 * rounding:g} mm, {1e3 * step_s:g} ms"
+        print(
+            f"| {' | '.join(row(name, moments, lambda c=corners, s=step_s: predicted(moments, scene, c, s), step_s))} |"
+        )
+    link_hulls.ROUNDING_M = usual
+    xml = scene / "xml"
+    print(f"| {' | '.join(row('MuJoCo, 10 ms', moments, lambda: simulated(moments, xml / 'leap_cube.xml'), 0.01))} |")
+
+
+if __name__ == "__main__":
+    main()
