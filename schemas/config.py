@@ -26,7 +26,8 @@ class CalibrateConfig(FileModel):
     """Further attempts (other seeds, then more features) after a model that fails the self-check."""
     turntable: bool | None = None
     """Whether the camera stands and what it shows turns: features are then taken from the pixels that differ from the
-    surroundings. Left out, the photos tell it: much looks the same at the same pixels of all."""
+    surroundings. Left out, the photos tell it: much looks the same at the same pixels of all. Unless it is false,
+    cameras are constrained to a turn about one axis where the matches support that."""
 
 
 class SplatConfig(FileModel):

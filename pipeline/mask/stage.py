@@ -103,6 +103,12 @@ def _photos(source: Path, body: str | None) -> _Photos:
         folder, bodies = source, []
     if not names:
         raise InputDataError(f"{folder}: no photos.", "photos .jpg, .jpeg or .png.", "name the folder that holds them.")
+    if len({Path(name).with_suffix("") for name in names}) < len(names):
+        raise InputDataError(
+            f"{folder}: two photos whose names differ in the suffix alone.",
+            "a name for each photo: its mask is <name>.png.",
+            "rename one of them.",
+        )
     if body is not None and body not in bodies:
         listed = ", ".join(bodies) or "none: a folder of photos has no bodies"
         raise UsageError(f"--body {body}: no such body in {source}.", f"bodies: {listed}.", "name one of them.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from itertools import pairwise
 from pathlib import Path
 
@@ -81,6 +82,8 @@ def test_a_capture_gets_the_label_of_its_body(tmp_path: Path) -> None:
 def test_what_cannot_be_done_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
     photos = folder(tmp_path / "photos", scene("what moves")[0])
     (tmp_path / "empty").mkdir()
+    shutil.copy(photos / "0.png", folder(tmp_path / "twice", []) / "a.png")
+    shutil.copy(photos / "0.png", tmp_path / "twice" / "a.jpg")
     out = tmp_path / "masks"
     for call, error, text in (
         (lambda: mask(photos, out), InputDataError, "the photos do not tell the body"),
@@ -89,11 +92,12 @@ def test_what_cannot_be_done_is_refused_and_leaves_nothing(tmp_path: Path) -> No
         (lambda: mask(photos, out, BOX, "9.png"), UsageError, "--photo 9.png: no such photo"),
         (lambda: mask(photos, out, BOX, body="a"), UsageError, "--body a: no such body"),
         (lambda: mask(tmp_path / "empty", out), InputDataError, "no photos"),
+        (lambda: mask(tmp_path / "twice", out), InputDataError, "names differ in the suffix alone"),
         (lambda: mask(tmp_path / "none", out), InputDataError, "none"),
     ):
         with pytest.raises(error, match=text):
             call()
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["empty", "photos"]
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["empty", "photos", "twice"]
 
 
 def test_a_body_that_is_lost_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
