@@ -152,7 +152,7 @@ def _likeliest(found: Sequence[_Fitted], before: float) -> list[_Fitted]:
     best = min(found, key=lambda one: one.cost, default=None)
     if best is None or best.cost - min(before, best.alone) > LIMITS.slight_bic:
         return []
-    helping = [one for one in found if one is not best and one.cost < before]
+    helping = sorted((one for one in found if one is not best and one.cost < before), key=lambda one: one.cost)
     return [best, *(one for one in helping if _unproven(best, one))]
 
 

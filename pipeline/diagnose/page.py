@@ -109,8 +109,8 @@ def _ranking(result: DiagnoseResult) -> str:
     if flight:
         words = (
             "In flight: how much better the data are described with the effect, as the fall of BIC (twice the rise of "
-            "the log-likelihood, less a charge for each fitted number). A difference of 10 between two effects is "
-            "strong evidence for the longer bar."
+            "the log-likelihood, less a charge for each fitted number and for an implausible size). A difference of 10 "
+            "between two effects is strong evidence for the longer bar."
         )
         pieces += [paragraph(words), _bars(flight, result, lambda one: -(one.delta_bic or 0.0))]
     if contact:
