@@ -105,6 +105,7 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
     kept = [w.without(LIMITS.wrong * float(np.median(sizes))) for w in windows]
     windows = [w for w in kept if len(w.left)]
     step = float(np.median([np.median(np.diff(w.times_s, axis=1)) for w in windows]))
+    span_s = float(np.median(np.concatenate([w.times_s[:, -1] - w.times_s[:, 0] for w in windows])))
     windows = [w.merged() for w in windows]
     ((alone, white_std),) = _likelihoods(windows, [CorrelatedNoise()])
     if white_std == 0:  # values that never change, or repeat a polynomial to the last bit: there are no errors to see
@@ -113,6 +114,8 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
     tried, alike = [], []
     for order, remembered in itertools.product(SHARES, REMEMBERED):
         time_s = -step / math.log(remembered)
+        if time_s > LIMITS.told_by_window * span_s and remembered > REMEMBERED[0]:
+            continue  # a curve, which the polynomials take away: its size would be a guess
         tried += [CorrelatedNoise(share, time_s, order=order) for share in SHARES[order]]
         alike += [1 + 2 * float(matern(gaps, time_s, order).sum())] * len(SHARES[order])
     found = []

@@ -128,6 +128,13 @@ class TrackNoiseThresholds:
         "see `sure_both`",
         "see `sure_both`",
     )
+    told_by_window: float = threshold(
+        0.5,
+        "windows",
+        "longest correlation time that is looked for: slower errors are curves in a window, which the polynomial takes "
+        "away, and whole flights tell them",
+        "by argument; in 20 measured tosses of 0.1 s, errors of 0.02 mm counted as 0.6 mm that last 130 ms",
+    )
     likely: float = threshold(
         2.0,
         "log L",

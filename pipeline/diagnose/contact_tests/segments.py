@@ -75,10 +75,10 @@ class SegmentsTest(ContactTest):
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bar, which is higher for an effect that sliding segments would show; none if they contradict."""
         best, sliding = equals[0], data.earlier.get("sliding", ())
-        if best.candidate.effect.phase != "contact" and not data.explained:  # flights, which show it too, do not fit
+        near = best.candidate.effect.phase != "contact"
+        if near and (data.flown or not data.explained):  # flights, which show it too, did not fit the model
             return (Bar(score=self.limits.alone_score, gain_t=self.limits.gain_t),)
-        unseen = (*self.limits.in_impacts_alone, *self.limits.hidden_in_slides)
-        if best.candidate.effect.phase != "contact" or best.name in unseen:
+        if near or best.name in self.limits.in_impacts_alone:
             return (Bar(score=self.limits.score, gain_t=self.limits.gain_t),)
         if not sliding:
             return (Bar(score=self.limits.alone_score, gain_t=self.limits.gain_t),)

@@ -25,7 +25,7 @@ def evidence(name: str, score: float = 30.0) -> Evidence:
 @pytest.mark.parametrize(
     ("name", "explained", "slides", "score"),
     [
-        ("adhesion", True, ("anisotropic_friction",), LIMITS.score),
+        ("adhesion", True, ("anisotropic_friction",), None),
         ("velocity_restitution", True, ("anisotropic_friction",), LIMITS.score),
         ("viscous_friction", True, ("anisotropic_friction",), None),
         ("viscous_friction", True, (), LIMITS.alone_score),
@@ -34,5 +34,7 @@ def evidence(name: str, score: float = 30.0) -> Evidence:
     ],
 )
 def test_the_bar_of_an_effect(name: str, explained: bool, slides: tuple[str, ...], score: float | None) -> None:
-    data: Any = SimpleNamespace(explained=explained, earlier={"sliding": [evidence(one, 200.0) for one in slides]})
+    data: Any = SimpleNamespace(
+        explained=explained, flown=False, earlier={"sliding": [evidence(one, 200.0) for one in slides]}
+    )
     assert [bar.score for bar in SegmentsTest().bars([evidence(name)], data)] == ([] if score is None else [score])
