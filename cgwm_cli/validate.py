@@ -1,4 +1,4 @@
-"""The verb `cgwm validate`: check a capture, model, dataset, ladder or run."""
+"""The verb `cgwm validate`: check a capture, model, dataset, ladder, run or masks."""
 
 from __future__ import annotations
 

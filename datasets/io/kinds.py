@@ -33,6 +33,11 @@ def kind_of(path: Path | str) -> Kind | None:
     return next((kind for kind, mark in _MARKS.items() if path.is_dir() and any(path.glob(mark))), None)
 
 
+def worded(kind: Kind) -> str:
+    """Return the kind of a directory with its article."""
+    return "a folder of masks" if kind == "masks" else f"a {kind}"
+
+
 def refuse_other_kind(path: Path, wanted: Kind) -> None:
     """Raise InputDataError unless the directory is of the wanted kind; the message says what it is instead."""
     if path.is_dir() and any(path.glob(_MARKS[wanted])):
@@ -46,7 +51,7 @@ def refuse_other_kind(path: Path, wanted: Kind) -> None:
         )
     if found is not None:
         raise InputDataError(
-            f"{path} is a {found} (it holds {_MARKS[found]}), not a {wanted}.",
+            f"{path} is {worded(found)} (it holds {_MARKS[found]}), not a {wanted}.",
             f"a {wanted}, a directory with {_MARKS[wanted]}.",
             f"{_USED_BY[found]}; pass a {wanted} here.",
         )

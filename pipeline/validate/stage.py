@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import find_faults
-from ...datasets.io.kinds import Kind, kind_of
+from ...datasets.io.kinds import Kind, kind_of, worded
 from ...datasets.models.agreement import require_contact
 from ...datasets.models.model import read_model
 from ...schemas import InputDataError, IntrinsicsFile, UsageError, read_json
@@ -39,7 +39,7 @@ def validate(
         return validate_intrinsics(path)
     kind = kind_of(path)
     if sample is not None and kind in ("capture", "model", "ladder", "run", "masks"):
-        raise UsageError(f"--sample: {path} is a {kind}, which is checked whole.", "a dataset.", "omit --sample.")
+        raise UsageError(f"--sample: {path} is {worded(kind)}, which is checked whole.", "a dataset.", "omit --sample.")
     if kind == "capture":
         return validate_capture(path, accept_units)
     if kind == "model":

@@ -571,7 +571,7 @@ def test_what_is_no_capture(root: Path, tmp_path: Path) -> None:
     )
     with pytest.raises(InputDataError) as caught:
         validate(tmp_path)
-    assert str(caught.value).startswith(f"{tmp_path}: no capture, model, dataset, ladder or run.")
+    assert str(caught.value).startswith(f"{tmp_path}: no capture, model, dataset, ladder, run or masks.")
 
 
 def test_opening_is_quick_and_decodes_no_photo(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

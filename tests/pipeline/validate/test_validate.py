@@ -333,7 +333,7 @@ def test_models(good: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_none_of_the_three(tmp_path: Path) -> None:
-    with pytest.raises(InputDataError, match=r"no capture, model, dataset, ladder or run"):
+    with pytest.raises(InputDataError, match=r"no capture, model, dataset, ladder, run or masks"):
         validate(tmp_path)
     with pytest.raises(InputDataError, match=r"no such directory"):
         validate(tmp_path / "absent")
