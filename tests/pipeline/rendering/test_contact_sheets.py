@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 from cgwm.pipeline.rendering.contact_sheets import (
     FrameStrip,
     _outline,
@@ -68,12 +69,13 @@ def test_errors_are_means_of_the_channels_in_tiles_with_margins() -> None:
     assert (error[:, :12] == 255).all() and (error[:, 27:] == 255).all()
 
 
-def test_frames_are_chosen_where_the_object_moves() -> None:
+@pytest.mark.parametrize("late", [True, False])
+def test_frames_are_chosen_where_the_object_moves(late: bool) -> None:
     masks = np.zeros((12, 20, 60), np.uint8)
     for k in range(12):
-        left = 4 * max(0, k - 6)
+        left = 4 * (max(0, k - 6) if late else min(k, 5))
         masks[k, 5:15, left : left + 10] = 1
     frames = np.zeros((12, 20, 60, 3), np.uint8)
     strip = FrameStrip(episode="a", camera="c", times_s=np.arange(12.0), real=frames, predicted=frames, masks=masks)
     chosen = telling(strip, 5)
-    assert chosen[0] == 0 and chosen[-1] == 11 and sum(k > 6 for k in chosen) >= 3
+    assert chosen[0] == 0 and chosen[-1] == 11 and sum((k > 6) == late for k in chosen) >= 3 + (not late)
