@@ -15,7 +15,7 @@ from .solid_grid import Array, Faces, Volume, crossings, grid_points
 
 _REACH = 2.0
 """How much farther than the nearest part of the old surface a face lies that still bounds a place, in pitches."""
-_RIM = 3.0
+_RIM = 4.0
 """Width of the rim of a face, whose points belong to it though hulls round edges off, in pitches."""
 _TAPER = 4.0
 """Width over which a plane goes over into a surface that is not flat, in pitches."""
@@ -160,22 +160,31 @@ class _Bounds:
 
 
 def _with_rims(solid: Volume, face: NDArray[np.intp], planes: Array) -> NDArray[np.intp]:
-    """Return the faces (S,) of the points of a surface, each grown by its rim."""
-    known, bare = face >= 0, np.flatnonzero(face < 0)
-    if not len(bare) or not known.any():
-        return face
-    away, nearest = KDTree(solid.surface[known]).query(solid.surface[bare])
-    owner = face[known][nearest]
-    moved = _off_plane(solid.surface[known][nearest], planes[owner])
-    close = _off_plane(solid.surface[bare], planes[owner]) < moved + solid.pitch
-    grown = face.copy()
-    grown[bare] = np.where((away < _RIM * solid.pitch) & close, owner, -1)
+    """Return the faces (S,) of the points of a surface, each grown by its rim: of several, the nearest plane counts.
+
+    What lies between two faces is their edge, however much a hull rounds it off.
+    """
+    bare, grown = np.flatnonzero(face < 0), face.copy()
+    least, beside, between = np.full(len(bare), np.inf), np.zeros(len(bare), int), np.zeros(len(bare), int)
+    for k, plane in enumerate(planes):
+        points = solid.surface[face == k]
+        if not len(points) or not len(bare):
+            continue
+        away, nearest = (np.asarray(found) for found in KDTree(points).query(solid.surface[bare]))
+        height = _off_plane(solid.surface[bare], plane)
+        rim = away < _RIM * solid.pitch
+        between += rim
+        lower = rim & (height < least)
+        # the rim moves as far as what lies beside it, but for what hulls round off
+        beside[lower] = height[lower] < _off_plane(points[nearest[lower]], plane) + solid.pitch
+        grown[bare[lower]], least[lower] = k, height[lower]
+    grown[bare[(beside == 0) & (between < 2)]] = -1
     return grown
 
 
 def _off_plane(points: Array, planes: Array) -> Array:
-    """Return the distance (n,) [m] of points (n, 3) from a plane (n, 4) each."""
-    return np.abs((points * planes[:, :3]).sum(1) - planes[:, 3])
+    """Return the distance (n,) [m] of points (n, 3) from a plane (4,), or from one (n, 4) each."""
+    return np.abs((points * planes[..., :3]).sum(-1) - planes[..., 3])
 
 
 def _without_chamfers(

@@ -26,8 +26,8 @@ _POINTS = 300
 """Patches of a region that are compared."""
 _REACH_PX, _STEPS = 5.5, 45
 """How far from the surface a plane is looked for [px], and in how many steps."""
-_LEAST_SEEN = 0.5
-"""Least share of a region's patches that each half of the photos must see."""
+_LEAST_SEEN, _LEAST_PAIRS = 0.5, 6
+"""Least share of a region's patches that each half of the photos must see, in so many ordered pairs: three photos."""
 _BEND_GAIN = 4e-3
 """Largest gain in correlation by bending the plane, on photos not fitted."""
 _APART_PX = 0.5
@@ -205,8 +205,8 @@ class Curves:
 
     @property
     def seen(self) -> float:
-        """Share of the patches that two photos see."""
-        return float((self.pairs > 0).mean())
+        """Share of the patches that three photos see."""
+        return float((self.pairs >= _LEAST_PAIRS).mean())
 
     def mean(self, values: Array) -> float:
         """Return the mean of values (n,) of the patches, weighted with the pairs of photos."""

@@ -14,6 +14,10 @@ LEAST_SHARE = 0.04
 """Smallest region, in units of the whole surface: on a small one a plane and a curved surface look alike."""
 NEAR_SHARE = 4e-3
 """Largest distance of a region's points from its plane, in units of the solid's size: a silhouette hull bulges."""
+ROUND = 0.025
+"""Standard deviation of a region from its plane, in units of the square root of its area, above which it is a cap of a
+round body and no face: 0.163 times the square root of its share on a ball (derived), 0.033 for the smallest region.
+"""
 _ALIKE = 0.94
 """Least cosine between the normal of a point and that of its region's plane: 20 degrees."""
 _WIDER, _WIDER_ALIKE = 4.0, 0.8
@@ -57,7 +61,9 @@ def planar_regions(solid: Volume, normals: Array, seed: int) -> Regions:
             continue
         members, plane = _grown(points, normals, area, near, region < 0, int(start), tolerance)
         tried[members] = True
-        if area[members].sum() >= LEAST_SHARE * area.sum():
+        off = points[members] @ plane[:3] - plane[3]
+        size = solid.pitch * float(np.sqrt(area[members].sum()))
+        if area[members].sum() >= LEAST_SHARE * area.sum() and off.std() <= ROUND * size:
             region[members] = len(planes)
             planes.append(plane)
     return Regions(region, np.array(planes).reshape(-1, 4))
