@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from .camera_models import LENS_PARAMETERS
+from .camera_models import LENS_PARAMETERS, focal_numbers
 from .reconstruction import Array, SfmCamera, SfmModel, distort
 from .triangulation import cross_matrices, projection_jacobian
 
@@ -129,7 +129,7 @@ def errors_px(model: SfmModel, image: str) -> Array:
 
 def moved_lens(camera: SfmCamera, lens: str, step: Array) -> SfmCamera:
     """Return a camera after a step of the free numbers that its camera model has."""
-    focals = 2 if lens == "OPENCV" else 1
+    focals = focal_numbers(lens)
     distortion = np.array(camera.distortion)
     distortion[: len(step) - focals] += step[focals:]
     k1, k2, p1, p2 = (float(value) for value in distortion)
@@ -158,7 +158,7 @@ def _lens_columns(slopes: Array, bent: Array, camera: SfmCamera, lens: str) -> l
     zero, r2 = np.zeros_like(x), x**2 + y**2
     focal = np.array([camera.fx, camera.fy])
     focals = [bent]
-    if lens == "OPENCV":
+    if focal_numbers(lens) == 2:
         focals = [np.stack([bent[:, 0], zero], 1), np.stack([zero, bent[:, 1]], 1)]
     lenses = [
         slopes * r2[:, None],

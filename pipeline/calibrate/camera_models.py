@@ -28,6 +28,11 @@ _TRUNCATE = 3.0
 """Residuals count as at most this many standard deviations."""
 
 
+def focal_numbers(model: str) -> int:
+    """Return how many of the free numbers of a camera model are focal lengths; they come first."""
+    return 2 if model == "OPENCV" else 1
+
+
 def richer(model: str, limit: str) -> tuple[str, ...]:
     """Return a camera model and those richer than it, up to `limit`."""
     return LADDER[LADDER.index(model) : max(LADDER.index(limit), LADDER.index(model)) + 1]

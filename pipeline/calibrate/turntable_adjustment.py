@@ -9,7 +9,7 @@ import numpy as np
 
 from .bundle import POSE, NormalEquations, errors_px, linearized, moved_lens
 from .camera_models import LENS_PARAMETERS
-from .reconstruction import Array, SfmModel
+from .reconstruction import SfmModel
 from .turntable_motion import TurntableMotion
 
 _FIRST_DAMPING, _MOST_DAMPING, _LEAST_DAMPING = 1e-3, 1e6, 1e-9
@@ -39,7 +39,7 @@ def adjusted(
             it is known otherwise, too.
         steps: Most steps.
     """
-    model = replace(model, T_cam_world=_in_order(motion.poses(), model))
+    model = motion.placed(model)
     damping, cost = _FIRST_DAMPING, _cost(model, loss_px, focals)
     for _ in range(steps):
         equations = _with_focals(linearized(model, models, loss_px), model, focals)
@@ -76,11 +76,7 @@ def _stepped(
         lens = along[first : first + LENS_PARAMETERS[models[camera]]]
         cameras[camera] = moved_lens(cameras[camera], models[camera], lens)
     points = model.points + reduced.points_step(along)
-    return replace(model, cameras=cameras, points=points, T_cam_world=_in_order(moved.poses(), model)), moved
-
-
-def _in_order(poses: dict[str, Array], model: SfmModel) -> dict[str, Array]:
-    return {image: poses[image] for image in model.T_cam_world}
+    return moved.placed(replace(model, cameras=cameras, points=points)), moved
 
 
 def _with_focals(equations: NormalEquations, model: SfmModel, focals: Map[str, tuple[float, float]]) -> NormalEquations:

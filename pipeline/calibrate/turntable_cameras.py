@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .bundle import POSE, errors_px
-from .camera_models import LENS_PARAMETERS, robust_cost, supported
+from .camera_models import LENS_PARAMETERS, focal_numbers, robust_cost, supported
 from .mapping import LOSS_SCALE, noise_px
 from .reconstruction import Array, SfmCamera, SfmModel, VerifiedPair
 from .turntable_adjustment import adjusted
@@ -79,7 +79,7 @@ def _constrained(model: SfmModel, lenses: Lenses, focals: Focals) -> TurntableCa
     noise = noise_px(free)
     turned, motion = start
     # from afar, under a loss as wide as the start is wrong
-    wide = noise_px(_lengths(replace(turned, T_cam_world={k: motion.poses()[k] for k in turned.T_cam_world})))
+    wide = noise_px(_lengths(motion.placed(turned)))
     if wide > _FAR * noise:
         return None
     richest = _present(lenses[list(lenses)[-1]], turned)
@@ -117,7 +117,7 @@ def _plain(camera: SfmCamera, lens: str | None) -> SfmCamera:
     """Return a camera without what a camera model does not have."""
     if lens is None:
         return camera
-    focals = 2 if lens == "OPENCV" else 1
+    focals = focal_numbers(lens)
     k1, k2, p1, p2 = (*camera.distortion[: LENS_PARAMETERS[lens] - focals], 0.0, 0.0, 0.0, 0.0)[:4]
     fx, fy = (camera.fx, camera.fy) if focals == 2 else (camera.focal_px, camera.focal_px)
     return replace(camera, fx=fx, fy=fy, distortion=(k1, k2, p1, p2))

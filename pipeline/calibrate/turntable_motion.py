@@ -7,7 +7,7 @@ In the frame of what turns, cameras are then T_cam_world = T_cam_axis Rz(angle):
 from __future__ import annotations
 
 from collections.abc import Mapping as Map
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,11 @@ class TurntableMotion:
             for ring, standing in zip(self.rings, self.T_cam_axis, strict=True)
             for image in ring
         }
+
+    def placed(self, model: SfmModel) -> SfmModel:
+        """Return a model with the poses of the motion, in the order that it has."""
+        poses = self.poses()
+        return replace(model, T_cam_world={image: poses[image] for image in model.T_cam_world})
 
     def design(self, names: list[str], lenses: int) -> Array:
         """Return how poses and intrinsics change with the numbers of the motion, shape (6 photos + lenses, n).
@@ -172,7 +177,7 @@ def _fixed(matrices: Array, shifts: Array) -> Array:
 
 def _groups(standing: Array, radius: float, cameras: NDArray[np.int64]) -> list[list[int]]:
     """Return the indices of poses (photo, 4, 4) of one camera that are alike, the largest group first."""
-    centers = -np.einsum("pji,pj->pi", standing[:, :3, :3], standing[:, :3, 3]) / radius
+    centers = _centers(standing) / radius
     apart = np.linalg.norm(centers[:, None] - centers, axis=2)
     between = np.einsum("pji,qjk->pqik", standing[:, :3, :3], standing[:, :3, :3])
     cosine = 0.5 * (np.trace(between, axis1=2, axis2=3) - 1.0)
@@ -186,7 +191,12 @@ def _groups(standing: Array, radius: float, cameras: NDArray[np.int64]) -> list[
     return groups
 
 
+def _centers(standing: Array) -> Array:
+    """Return the optical centres (photo, 3) of poses (photo, 4, 4)."""
+    return -np.einsum("pji,pj->pi", standing[:, :3, :3], standing[:, :3, 3])
+
+
 def _middle(standing: Array) -> Array:
     """Return the pose in the middle of poses (photo, 4, 4)."""
-    centers = -np.einsum("pji,pj->pi", standing[:, :3, :3], standing[:, :3, 3])
+    centers = _centers(standing)
     return _pose(Rotation.from_matrix(standing[:, :3, :3]).mean().as_matrix(), np.median(centers, axis=0))

@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Mask = NDArray[np.bool_]
+from .graph_cut import Band, Mask, cut
 
+_RIM_PX = 3.0
+"""Half width of the band about what stands before the background, in which it is cut out [px]."""
 _BORDER = 0.03
 """Width of the border whose colour is that of the background, of the shorter side of the photo."""
 _PLAIN_SHARE = 0.9
@@ -18,6 +20,12 @@ _CLOSED = 0.012
 """Radius of the gaps that are closed, of the longer side."""
 _LEAST_AREA, _MOST_AREA = 0.002, 0.9
 """Least and largest share of a photo that a body fills."""
+
+
+def cut_out(image: NDArray[np.uint8]) -> Mask | None:
+    """Return the pixels (H, W) of what stands before a plain background, cut along its edges; None as `foreground`."""
+    start = foreground(image)
+    return None if start is None else cut(image, Band.about(start, start, _RIM_PX))
 
 
 def foreground(image: NDArray[np.uint8]) -> Mask | None:

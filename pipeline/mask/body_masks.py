@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from ...datasets.io.progress import progress
 from ..foreground.graph_cut import Band, ColorModels, Mask, cut, cut_like, dilated
-from ..foreground.plain_background import foreground
+from ..foreground.plain_background import cut_out
 from ..foreground.standing_camera import places_of_camera, surroundings, turning
 
 Photo = NDArray[np.uint8]
 
-_RIM_PX = 3.0
-"""Half width of the band about what stands before a plain background [px]."""
 _TURNING_RIM = 0.02
 """Half width of the band about what turns, of the longer side of the photo."""
 _REACH = 0.3
@@ -31,10 +29,10 @@ def before_plain(photos: Sequence[Photo]) -> list[Mask] | None:
     """Return the masks (H, W) of what all photos show before a background of one colour; None where one does not."""
     masks = []
     for photo in progress(photos, "masks", unit="photo"):
-        start = foreground(photo)
-        if start is None:
+        mask = cut_out(photo)
+        if mask is None:
             return None
-        masks.append(_tidy(cut(photo, Band.about(start, start, _RIM_PX))))
+        masks.append(_tidy(mask))
     return masks
 
 

@@ -22,7 +22,7 @@ from ...datasets.capture.cameras import Camera
 from ...datasets.capture.capture import Capture
 from ...schemas import Ground
 from ..foreground.graph_cut import Band, Mask, cut, dilated, eroded
-from ..foreground.plain_background import foreground
+from ..foreground.plain_background import cut_out
 from ..geometry.solid_grid import Array, crossings, grid_points
 from ..geometry.spheres import Spheres
 from ..rendering.render import render
@@ -38,8 +38,6 @@ _GRID = 72
 _OUTVOTED = 0.05
 """Share of the photos that may exclude a point of the body and are outvoted."""
 _MIN_VIEWS = 3
-_RIM_PX = 3.0
-"""Half width of the band about what stands before a plain background [px]."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +124,12 @@ def outline_before_plain(capture: Capture, train: Sequence[View], test: Sequence
     """
     views, fitted = [*train, *test], slice(len(train))
     pictures = [_Picture.read(capture, view) for view in views]
-    starts = [start for picture in pictures if (start := foreground(picture.image)) is not None]
-    if len(starts) < len(pictures):
-        return None
-    masks = [cut(p.image, Band.about(start, start, _RIM_PX)) for p, start in zip(pictures, starts, strict=True)]
+    masks = []
+    for picture in pictures:
+        mask = cut_out(picture.image)
+        if mask is None:
+            return None
+        masks.append(mask)
     labels = [np.where(mask, index + 1, 0).astype(np.uint8) for mask in masks]
     bodies = len(capture.manifest.bodies)
     found = [with_labels(view, own, bodies) for view, own in zip(views, labels, strict=True)]
