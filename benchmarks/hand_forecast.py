@@ -11,19 +11,20 @@ a step. `still` is a cube that stays; `MuJoCo, 10 ms` is the scene in which judo
 from __future__ import annotations
 
 import argparse
+import importlib
 import math
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import hand
-import mujoco
 import numpy as np
 import torch
 from cgwm.pipeline.control.hand_controller import HandController
-from cgwm.pipeline.control.hand_loop import goals_of
+from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_objective import turn_to
 from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
 from cgwm.pipeline.control.horizon import Array
@@ -33,6 +34,8 @@ from cgwm.pipeline.physics.world import State
 from cgwm.pipeline.sg_gs import link_hulls
 from cgwm.schemas import HandTask
 
+mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs
+
 INTERVAL_S, AHEAD, EVERY = 0.05, 10, 3
 CHECKED = (2, 5, 10)
 """Commands after the start at which predictions are compared."""
@@ -41,6 +44,11 @@ COMPARED = (
     (0.0005, 16, 0.002),
 )  # fmt: skip
 """Radius by which corners are rounded [m], corners of a link, and step [s] of the predictions compared."""
+COLUMNS = {
+    "position_m": "position_m", "quat_wxyz": "quat_wxyz", "velocity_m_s": "velocity_m_s",
+    "omega_body_rad_s": "omega_body_rad_s", "joints": "joints_rad", "speeds": "speeds_rad_s",
+}  # fmt: skip
+"""Columns of a recording with the state before each command, and the fields of the state."""
 Motion = tuple[Array, Array]
 """Positions (starts, AHEAD + 1, 3) [m] and orientations (starts, AHEAD + 1, 4) of the cube."""
 
@@ -55,33 +63,24 @@ class Moment:
     """Targets before the start and at the end of each command, shape (AHEAD + 1, joints)."""
 
 
-def task_of(folder: str, scene: Path, corners: int, step_s: float) -> HandTask:
+def task_of(folder: str, scene: Path, corners: int, step_s: float, seconds: float = 60.0) -> HandTask:
     """Return the task of `hand.py` with plans of 64 samples over 0.5 s."""
-    given = argparse.Namespace(corners=corners, hz=1 / INTERVAL_S, samples=64, horizon=0.5, step=step_s, seconds=60.0)
+    given = argparse.Namespace(
+        corners=corners, hz=1 / INTERVAL_S, samples=64, horizon=0.5, step=step_s, seconds=seconds
+    )
     return hand.task_in(Path(folder), scene, given)
 
 
 def moments_of(scene: Path, seed: int, seconds: float) -> Iterator[Moment]:
     """Yield the starts of one run of the controller."""
     with tempfile.TemporaryDirectory() as folder:
-        controller = HandController(hand.cube(), task_of(folder, scene, 16, 0.005))
-        plant, goals = HandScenePlant(controller.hand), goals_of(controller.task, seed)
-        truths, targets = [plant.reset(np.array(hand.PLACE_M), np.array([1.0, 0, 0, 0]))], [controller.hand.home]
-        controller.restart(seed)
-        goal = next(goals)
-        controller.aim(goal)
-        for number in range(round(seconds / INTERVAL_S)):
-            now = truths[-1]
-            command = controller.command(now.measured(INTERVAL_S * number, now.position_m, now.quat_wxyz))
-            targets.append(np.array([command[name] for name in controller.joints]))
-            truths.append(plant.advance(targets[-1], INTERVAL_S))
-            if np.linalg.norm(truths[-1].position_m - hand.PLACE_M) > controller.task.success.drop_m:
-                break
-            if _turn_deg(truths[-1].quat_wxyz, goal) < controller.task.success.turn_deg:
-                goal = next(goals)
-                controller.aim(goal)
+        controller = HandController(hand.cube(), task_of(folder, scene, 16, 0.005, seconds))
+        found = run_hand(controller, HandScenePlant(controller.hand), seed, "ideal")
+        columns = {name: found.column(name) for name in COLUMNS}
+        targets, names = found.column("target"), controller.joints
+    truths = [HandTruth(names=names, **{COLUMNS[k]: v[row] for k, v in columns.items()}) for row in range(len(targets))]
     for k in range(2, len(truths) - AHEAD, EVERY):
-        yield Moment(truths=truths[k : k + AHEAD + 1], targets_rad=np.stack(targets[k : k + AHEAD + 1]))
+        yield Moment(truths=truths[k : k + AHEAD + 1], targets_rad=targets[k - 1 : k + AHEAD])
 
 
 def still(moments: list[Moment]) -> Motion:
