@@ -28,7 +28,7 @@ from store import ROOT, commit_of_tree
 
 RESULTS = ROOT / "benchmarks" / "results"
 DOCS = ROOT / "docs"
-MOST_LINES = 100
+MOST_LINES = 150
 """Length of a page that a reader still looks through."""
 STATUSES = ("transcribed", "measured")
 _COMMIT = re.compile(r"[0-9a-f]{7,40}\+?")
@@ -188,22 +188,32 @@ def _page(subject: dict[str, Any], claims: list[dict[str, Any]]) -> str:
     ]
     for claim in claims:
         lines += ["", f"## {claim['title']}", "", *([claim["about"], ""] if "about" in claim else [])]
-        lines += ["| figure | value | target | | command | commit | machine |", "| --- " * 7 + "|"]
-        lines += [_line(one) for one in claim["figures"]]
+        lines += _table(claim["figures"])
     return "\n".join(lines) + "\n"
+
+
+def _table(figures: list[Figure]) -> list[str]:
+    """Return a table of figures, then what a reader must know of some of them, then the runs that measured them."""
+    runs: dict[str, int] = {}
+    rows, notes = [], []
+    for number, one in enumerate(figures, 1):
+        run = runs.setdefault(_run(one), len(runs) + 1)
+        rows.append(_row(str(number), one.figure, _value(one), one.target, _verdict(one), f"R{run}"))
+        notes += [f"- {number}: {one.note.rstrip('.')}."] if one.note else []
+    lines = ["| | figure | value | target | | run |", "| --- " * 6 + "|", *rows]
+    lines += ["", "To these figures:", "", *notes] if notes else []
+    return [*lines, "", "Runs:", "", *(f"- R{run}: {text}" for text, run in runs.items())]
+
+
+def _run(one: Figure) -> str:
+    """Return what measured a figure: command, commit, date and machine."""
+    day = f"({one.date})" if one.status == "transcribed" else one.date
+    return f"`{one.command}`, at `{one.commit}` {day}, {one.machine}."
 
 
 def _place(claim: dict[str, Any]) -> str:
     """Return the link to a claim's table."""
     return f"results-{claim['page']}.md#{_anchor(claim['title'])}"
-
-
-def _line(one: Figure) -> str:
-    figure = f"{one.figure} ({one.note})" if one.note else one.figure
-    day = f"({one.date})" if one.status == "transcribed" else one.date
-    return _row(
-        figure, _value(one), one.target, _verdict(one), f"`{one.command}`", f"`{one.commit}` {day}", one.machine
-    )
 
 
 def _row(*cells: str) -> str:
