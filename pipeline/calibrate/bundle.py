@@ -71,9 +71,15 @@ class ReducedEquations:
     inverse: sparse.csr_array
     """Inverse of the points' blocks."""
 
-    def points_step(self, step: Array) -> Array:
-        """Return the step of the points (point, 3) that belongs to one of poses and intrinsics (n,)."""
-        return (self.inverse @ (self.whole.points_right.ravel() - self.whole.coupling.T @ step)).reshape(-1, 3)
+    def points_step(self, step: Array, share: float = 1.0) -> Array:
+        """Return the step of the points (point, 3) that belongs to one of poses and intrinsics (n,).
+
+        Args:
+            step: The step of poses and intrinsics.
+            share: Share of the whole step that it is.
+        """
+        slope = share * self.whole.points_right.ravel() - self.whole.coupling.T @ step
+        return np.asarray(self.inverse @ slope).reshape(-1, 3)
 
 
 def linearized(model: SfmModel, models: Map[str, str], loss_px: float = np.inf) -> NormalEquations:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping as Map
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from .bundle import POSE, NormalEquations, errors_px, linearized, moved_lens
+from ..optimization.least_squares import Policy, descend
+from ..optimization.problem import Box, Point, Problem, Rows
+from .bundle import NormalEquations, ReducedEquations, errors_px, linearized, moved_lens
 from .camera_models import LENS_PARAMETERS
-from .reconstruction import SfmModel
+from .reconstruction import Array, SfmModel
 from .turntable_motion import TurntableMotion
 
-_FIRST_DAMPING, _MOST_DAMPING, _LEAST_DAMPING = 1e-3, 1e6, 1e-9
-_UP, _DOWN = 8.0, 5.0
-_DONE = 1e-5
-"""Relative decrease of the cost below which the adjustment ends."""
+_POLICY = Policy(
+    iterations=160, damping=1e-3, up=8.0, least_damping=1e-9, most_damping=1e6, relative=1e-5, linearise_end=False
+)
 
 
 def adjusted(
@@ -28,8 +32,6 @@ def adjusted(
 ) -> tuple[SfmModel, TurntableMotion]:
     """Adjust a turntable's motion, points and intrinsics to the observations, under a Cauchy loss.
 
-    Damped Gauss-Newton; the points are eliminated.
-
     Args:
         model: The model, with the axis of the turntable along z. Its poses are replaced by those of the motion.
         motion: The motion to start from.
@@ -39,60 +41,142 @@ def adjusted(
             it is known otherwise, too.
         steps: Most steps.
     """
-    model = motion.placed(model)
-    damping, cost = _FIRST_DAMPING, _cost(model, loss_px, focals)
-    for _ in range(steps):
-        equations = _with_focals(linearized(model, models, loss_px), model, focals)
-        while damping < _MOST_DAMPING:
-            tried, moved = _stepped(model, motion, models, equations, damping)
-            lower = _cost(tried, loss_px, focals)
-            if lower < cost:
-                break
-            damping *= _UP
-        else:
-            break
-        gain = (cost - lower) / cost
-        model, motion, cost, damping = tried, moved, lower, max(damping / _DOWN, _LEAST_DAMPING)
-        if gain < _DONE:
-            break
-    return model, motion
+    problem = _Adjustment(model, motion, models, loss_px, focals)
+    return problem.model_at(descend(problem, problem.start(), replace(_POLICY, steps=steps)).point)
 
 
-def _stepped(
-    model: SfmModel, motion: TurntableMotion, models: Map[str, str], equations: NormalEquations, damping: float
-) -> tuple[SfmModel, TurntableMotion]:
-    names = list(model.T_cam_world)
-    lenses = len(equations.right) - POSE * len(names)
-    design = motion.design(names, lenses)
-    reduced = equations.reduced(damping)
-    free = design.T @ reduced.matrix @ design
-    diagonal = np.einsum("ij,ij->j", design, equations.matrix @ design)
-    free[np.diag_indices_from(free)] += damping * diagonal + np.finfo(float).tiny
-    step = np.asarray(np.linalg.lstsq(free, design.T @ reduced.right)[0], np.float64)
-    along = design @ step
-    moved = motion.moved(step)
-    cameras = dict(model.cameras)
-    for camera, first in equations.columns.items():
-        lens = along[first : first + LENS_PARAMETERS[models[camera]]]
-        cameras[camera] = moved_lens(cameras[camera], models[camera], lens)
-    points = model.points + reduced.points_step(along)
-    return moved.placed(replace(model, cameras=cameras, points=points)), moved
+class _Adjustment(Problem):
+    """One group and one item, whose states are the points of a model and its motion.
+
+    The parameters are the sums of the steps of the motion's numbers (see `TurntableMotion.design`), which move it along
+    its rotations, and the changes of the intrinsics.
+    """
+
+    def __init__(
+        self,
+        model: SfmModel,
+        motion: TurntableMotion,
+        models: Map[str, str],
+        loss_px: float,
+        focals: Map[str, tuple[float, float]],
+    ) -> None:
+        self._model, self._motion, self._models, self._loss_px = model, motion, models, loss_px
+        self._lenses, count = {}, motion.numbers
+        for camera, name in models.items():
+            self._lenses[camera] = slice(count, count + LENS_PARAMETERS[name])
+            count += LENS_PARAMETERS[name]
+        self.owner = torch.zeros(1, dtype=torch.long)
+        centre, information = torch.zeros(2, 1, count, dtype=torch.float64)
+        for camera, (focal_px, weight) in focals.items():
+            column = self._lenses[camera].start
+            centre[0, column], information[0, column] = focal_px - model.cameras[camera].fx, weight
+        self.box = replace(Box.unbounded(centre), centre=centre, information=information)
+
+    def start(self) -> Point:
+        """Return where the adjustment begins."""
+        points = torch.as_tensor(self._model.points, dtype=torch.float64)
+        return Point(values=torch.zeros_like(self.box.low), states=(points[None], *_states(self._motion)))
+
+    def model_at(self, point: Point) -> tuple[SfmModel, TurntableMotion]:
+        """Return the model and the motion at a point."""
+        values, (points, standing, angles) = point.values[0].numpy(), (state[0].numpy() for state in point.states)
+        names = [image for ring in self._motion.rings for image in ring]
+        turned = {image: float(angle) for image, angle in zip(names, angles, strict=True)}
+        motion = TurntableMotion(self._motion.rings, tuple(standing), turned)
+        cameras = dict(self._model.cameras)
+        for camera, columns in self._lenses.items():
+            cameras[camera] = moved_lens(cameras[camera], self._models[camera], values[columns])
+        return motion.placed(replace(self._model, cameras=cameras, points=points)), motion
+
+    def costs(self, point: Point, rows: Rows) -> Tensor:
+        """Return the Cauchy loss of all observations [px^2], infinite where a point is behind a camera that sees it."""
+        del rows
+        model, _ = self.model_at(point)
+        return self._cost(model, np.concatenate([errors_px(model, image) for image in model.T_cam_world]))
+
+    def linearised(self, point: Point, rows: Rows) -> _PointsApart:
+        """Return the normal equations, with the points apart."""
+        del rows
+        model, motion = self.model_at(point)
+        whole = linearized(model, self._models, self._loss_px)
+        design = motion.design(list(model.T_cam_world), self.box.low.shape[1] - motion.numbers)
+        return _PointsApart(whole=whole, design=design, cost=self._cost(model, whole.residuals_px))
+
+    def moved(self, point: Point, values: Tensor, step: Tensor, rows: Rows) -> tuple[Tensor, ...]:
+        """Return the points and the motion after a step."""
+        del rows
+        _, motion = self.model_at(point)
+        along = (values - point.values)[0, : motion.numbers].numpy()
+        return (point.states[0] + step.unflatten(1, (-1, 3)), *_states(motion.moved(along)))
+
+    def _cost(self, model: SfmModel, lengths: Array) -> Tensor:
+        """Return the loss of errors (observation,) of a model."""
+        loss = float(self._loss_px**2 * np.log1p((lengths / self._loss_px) ** 2).sum())
+        for image, pose in model.T_cam_world.items():
+            depth = model.points[model.observations[image][1]] @ pose[2, :3] + pose[2, 3]
+            if (depth <= 0).any():
+                loss = np.inf
+        return torch.tensor([loss], dtype=torch.float64)
 
 
-def _with_focals(equations: NormalEquations, model: SfmModel, focals: Map[str, tuple[float, float]]) -> NormalEquations:
-    for camera, (focal, weight) in focals.items():
-        column = equations.columns[camera]
-        equations.matrix[column, column] += weight
-        equations.right[column] += weight * (focal - model.cameras[camera].fx)
-    return equations
+def _states(motion: TurntableMotion) -> tuple[Tensor, Tensor]:
+    """Return the poses (1, ring, 4, 4) of a motion, and the angles (1, photo) of the photos of its rings in turn."""
+    angles = [motion.angles[image] for ring in motion.rings for image in ring]
+    return torch.as_tensor(np.array(motion.T_cam_axis))[None], torch.tensor([angles], dtype=torch.float64)
 
 
-def _cost(model: SfmModel, loss_px: float, focals: Map[str, tuple[float, float]]) -> float:
-    """Return the Cauchy loss of all observations [px^2], infinite where a point is behind a camera that sees it."""
-    total = sum(weight * (model.cameras[camera].fx - focal) ** 2 for camera, (focal, weight) in focals.items())
-    for image, pose in model.T_cam_world.items():
-        depth = model.points[model.observations[image][1]] @ pose[2, :3] + pose[2, 3]
-        if (depth <= 0).any():
-            return np.inf
-        total += float(loss_px**2 * np.log1p((errors_px(model, image) / loss_px) ** 2).sum())
-    return float(total)
+@dataclass(frozen=True, kw_only=True)
+class _PointsApart:
+    """Normal equations whose states are points, each of them coupled to the photos that see it only."""
+
+    whole: NormalEquations
+    """Of poses, intrinsics and points."""
+    design: Array
+    """How poses and intrinsics change with the parameters, shape (n, P)."""
+    cost: Tensor
+    """Cost, shape (1,)."""
+
+    def at(self, items: Tensor) -> _PointsApart:
+        """Return the equations of the one item."""
+        del items
+        return self
+
+    def put(self, items: Tensor, other: _PointsApart) -> _PointsApart:
+        """Return the equations that replace those of the one item."""
+        del self, items
+        return other
+
+    def finite(self) -> Tensor:
+        """Return whether the gradient is finite, shape (1,)."""
+        whole = self.whole
+        return torch.tensor([bool(np.isfinite(whole.right).all() and np.isfinite(whole.points_right).all())])
+
+    def eliminated(self, damping: Tensor | None = None, unit: Tensor | None = None) -> _WithoutPoints:
+        """Eliminate the points, damped in units of the diagonal of their blocks."""
+        del unit
+        return _WithoutPoints(self.whole.reduced(0.0 if damping is None else float(damping)), self.design)
+
+
+@dataclass(frozen=True)
+class _WithoutPoints:
+    """Normal equations of a turntable's motion and intrinsics, points eliminated."""
+
+    reduced: ReducedEquations
+    """Of poses and intrinsics."""
+    design: Array
+    """How these change with the parameters, shape (n, P)."""
+
+    @cached_property
+    def information(self) -> Tensor:
+        """Information on the parameters, shape (1, P, P)."""
+        return torch.as_tensor(self.design.T @ self.reduced.matrix @ self.design)[None]
+
+    @property
+    def score(self) -> Tensor:
+        """Negative gradient by the parameters, shape (1, P)."""
+        return torch.as_tensor(self.design.T @ self.reduced.right)[None]
+
+    def following(self, change: Tensor, share: float = 1.0) -> Tensor:
+        """Return the step (1, 3 points) of the points for changes (1, P), a share of the whole step."""
+        step = self.reduced.points_step(self.design @ change[0].numpy(), share)
+        return torch.as_tensor(step.reshape(1, -1))

@@ -20,7 +20,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from .problem import Box, Eliminated, NormalEquations, Point, Problem, Rows, damped, solved
+from .problem import Box, Equations, Point, Problem, Reduced, Rows, damped, solved
 
 
 class Stop(IntEnum):
@@ -88,7 +88,7 @@ class Descent:
     """What descends."""
     point: Point
     """Best point."""
-    normal: NormalEquations
+    normal: Equations
     """Normal equations at the point, or where its last step began (see `Policy.linearise_end`)."""
     item_cost: Tensor
     """Cost of each item at the point, shape (B,)."""
@@ -230,7 +230,7 @@ def _trials(descent: Descent, policy: Policy, rows: Rows) -> _Trials:
     return _Trials(point=joined, rows=rows.repeated(len(points)), damping=torch.stack(dampings), size=size)
 
 
-def _step(reduced: Eliminated, values: Tensor, box: Box, damping: Tensor, rows: Rows) -> Tensor:
+def _step(reduced: Reduced, values: Tensor, box: Box, damping: Tensor, rows: Rows) -> Tensor:
     """Return the damped step (g, P) of the parameters (g, P); those that a bound stops do not move."""
     count = len(values)
     if not values.shape[1]:
@@ -316,7 +316,7 @@ def _judged(
     )
 
 
-def _linearised(descent: Descent, rows: Rows, normal: NormalEquations) -> Descent:
+def _linearised(descent: Descent, rows: Rows, normal: Equations) -> Descent:
     """Return the descent with new normal equations of some rows."""
     groups = rows.groups
     own = by_group(normal.cost, rows.owner, len(groups))
@@ -330,6 +330,6 @@ def _linearised(descent: Descent, rows: Rows, normal: NormalEquations) -> Descen
     return replace(descent, normal=descent.normal.put(rows.items, normal))
 
 
-def _finite(normal: NormalEquations, rows: Rows) -> Tensor:
+def _finite(normal: Equations, rows: Rows) -> Tensor:
     """Return whether the gradients of all items of each group are finite, shape (g,)."""
     return by_group((~normal.finite()).long(), rows.owner, len(rows.groups)) == 0

@@ -155,6 +155,7 @@ class _SharedAndStates(Problem):
 def _solution(problem: _SharedAndStates, end: Descent) -> Solution:
     """Return the end of a descent as a solution."""
     shared, states, normal = end.point.values[0], end.point.states[0], end.normal
+    assert isinstance(normal, NormalEquations)  # as the problem makes them
     reduced = normal.eliminated(torch.full_like(normal.cost, LAST_DAMPING))
     bounds = problem.box
     rows, _ = problem.residuals(shared, states, False)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
@@ -128,6 +129,52 @@ class Box:
         """
         stopped = ((values <= self.low) & (downhill < 0)) | ((values >= self.high) & (downhill > 0))
         return ~stopped & (self.low < self.high)
+
+
+class Reduced(Protocol):
+    """Normal equations of items with their states eliminated, as far as the solver needs to know them."""
+
+    @property
+    def information(self) -> Tensor:
+        """Information on the parameters, shape (B, P, P)."""
+        ...
+
+    @property
+    def score(self) -> Tensor:
+        """Negative gradient by the parameters, shape (B, P)."""
+        ...
+
+    def following(self, change: Tensor, share: float = 1.0) -> Tensor:
+        """Return the step (B, S) of the states for changes (B, P) of the parameters, a share of the whole step."""
+        ...
+
+
+class Equations(Protocol):
+    """Normal equations of half the cost of items (B), as far as the solver needs to know them.
+
+    `NormalEquations` are dense. A problem whose states are sparsely coupled has a form of its own.
+    """
+
+    @property
+    def cost(self) -> Tensor:
+        """Cost of each item, shape (B,)."""
+        ...
+
+    def at(self, items: Tensor) -> Self:
+        """Return the equations of some items (b,)."""
+        ...
+
+    def put(self, items: Tensor, other: Self) -> Self:
+        """Return the equations with those of some items (b,) replaced."""
+        ...
+
+    def finite(self) -> Tensor:
+        """Return whether the gradient of each item is finite, shape (B,)."""
+        ...
+
+    def eliminated(self, damping: Tensor | None = None, unit: Tensor | None = None) -> Reduced:
+        """Eliminate the states, damped by (B,) times a unit of each coordinate (S,)."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,7 +349,7 @@ class Problem(ABC):
     """Whether derivatives are computed at every trial, because they cost little more than the cost alone."""
 
     @abstractmethod
-    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+    def linearised(self, point: Point, rows: Rows) -> Equations:
         """Return the normal equations of items (b) at a point of rows."""
 
     def costs(self, point: Point, rows: Rows) -> Tensor:

@@ -11,6 +11,7 @@ from cgwm.pipeline.calibrate.bundle import linearized
 from cgwm.pipeline.calibrate.center_uncertainty import center_stds
 from cgwm.pipeline.calibrate.metric_scale import umeyama
 from cgwm.pipeline.calibrate.reconstruction import SfmCamera, SfmModel, Similarity, VerifiedPair
+from cgwm.pipeline.calibrate.turntable_adjustment import adjusted
 from cgwm.pipeline.calibrate.turntable_cameras import on_turntable
 from cgwm.pipeline.calibrate.turntable_motion import TurntableMotion, turntable_motion
 from scipy.spatial.transform import Rotation
@@ -141,6 +142,22 @@ def test_the_design_of_a_motion_is_its_derivative() -> None:
         shift = -moved[name][:3, :3].T @ moved[name][:3, 3] + before[name][:3, :3].T @ before[name][:3, 3]
         turn = Rotation.from_matrix(moved[name][:3, :3] @ before[name][:3, :3].T).as_rotvec()
         assert (design @ step)[6 * k : 6 * k + 6] == pytest.approx(np.concatenate([shift, turn]), abs=1e-10)
+
+
+def test_an_adjustment_ends_where_no_number_of_the_motion_the_lens_or_a_point_lowers_the_loss() -> None:
+    model, _ = observed(truth())
+    start = turntable_motion(bent(model, 0.02))
+    assert start is not None
+    known_px, weight = 790.0, 1e-3
+    found, motion = adjusted(*start, {"photos": "SIMPLE_RADIAL"}, 1.0, {"photos": (known_px, weight)})
+    assert found.T_cam_world.keys() == model.T_cam_world.keys()
+    assert all(np.array_equal(found.T_cam_world[name], pose) for name, pose in motion.poses().items())
+    before = linearized(motion.placed(start[0]), {"photos": "SIMPLE_RADIAL"}, 1.0)
+    after = linearized(found, {"photos": "SIMPLE_RADIAL"}, 1.0)
+    after.right[after.columns["photos"]] += weight * (known_px - found.cameras["photos"].fx)
+    design = motion.design(list(found.T_cam_world), 2)
+    assert np.abs(design.T @ after.right).max() < 1e-3 * np.abs(design.T @ before.right).max()
+    assert np.abs(after.points_right).max() < 1e-2 * np.abs(before.points_right).max()
 
 
 def test_rings_need_photos_of_one_camera() -> None:
