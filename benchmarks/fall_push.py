@@ -143,6 +143,7 @@ def run(
     captures: int | None = None,
     workers: int = 1,
     seconds: float = float("inf"),
+    first: Sequence[str] = (),
 ) -> int:
     """Make what is missing of captures, models and results, and return how many steps are left.
 
@@ -157,6 +158,7 @@ def run(
         captures: So many captures of every engine and task, see `drawn`; None for all.
         workers: How many steps run at once.
         seconds: No step begins later.
+        first: Objects whose captures come first, see `ordered`.
     """
     made: dict[tuple[str, ...], Step] = {}
     steps: list[Step] = []
@@ -167,7 +169,7 @@ def run(
             steps.append(made[key])
         return made[key]
 
-    for cell in drawn(names, captures):
+    for cell in ordered(drawn(names, captures), first, store.results()):
         task, obj, material, engine = cell
         of_cell = work.cell(task, obj, material, engine)
         rows = [row for row in names["rows"] if engine in JUDGES or row in (REFERENCE, FLOOR)]
@@ -204,6 +206,20 @@ def drawn(names: dict[str, Sequence[str]], captures: int | None) -> list[tuple[s
         for index, pair in enumerate([one for one in able[engine] if (task, one[0]) not in UNABLE][:captures])
     ]
     return [cell for _, cell in (sorted(cells, key=lambda one: one[0]) if captures is not None else cells)]
+
+
+def ordered(
+    cells: Sequence[tuple[str, str, str, str]], first: Sequence[str], results: Sequence[dict[str, Any]]
+) -> list[tuple[str, str, str, str]]:
+    """Return cells with those of the objects `first` first, in that order; without such objects as they are.
+
+    Cells that have a result already come last, since a table that was cut off lacks whole objects rather than rows.
+    """
+    if not first:
+        return list(cells)
+    begun = {(row["task"], row["object"], row["material"], row.get("engine", ENGINE)) for row in results}
+    rank = {obj: place for place, obj in enumerate(first)}
+    return sorted(cells, key=lambda cell: (cell in begun, rank.get(cell[1], len(rank))))
 
 
 def _capture_step(work: Work, store: Store, jobs: Sequence[Job], cell: tuple[str, str, str, str]) -> Step:
@@ -244,6 +260,7 @@ def main() -> int:
     parser.add_argument("--materials", default=",".join(MATERIALS))
     parser.add_argument("--rows", default="; ".join(ROWS), help="names of rows, separated by semicolons")
     parser.add_argument("--captures", type=int, help="of every engine and task, drawn; left out, all")
+    parser.add_argument("--first", default="", help="objects whose captures come first; those with results come last")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
@@ -273,7 +290,8 @@ def main() -> int:
     if not given.table:
         work = Work(given.folder.resolve(), given.seed, given.device)
         with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            left = run(work, store, names, pool, given.psnr_every, given.captures, given.workers, given.seconds)
+            first = [one.strip() for one in given.first.split(",") if one.strip()]
+            left = run(work, store, names, pool, given.psnr_every, given.captures, given.workers, given.seconds, first)
         print(f"{left} steps are left.", file=sys.stderr)
     print(engine_table(store.results(), names) if given.by_engine else table(store.results(), names, given.seed))
     return 0
