@@ -131,6 +131,7 @@ def _not_run(wanted: Sequence[RealCase], own: dict[str, Any]) -> list[str]:
 def _added(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return lines about the errors on the test split after and before, and how the intervals cover."""
     from diagnose import covered
+    from missing_effects_figures import comparable
 
     right = [row for row in rows if "errors" in row and judge(row["truth"], row["answer"])["mark"] in RIGHT]
     lines = []
@@ -141,7 +142,9 @@ def _added(rows: Sequence[dict[str, Any]]) -> list[str]:
             low, middle, high = np.percentile(ratios, (25, 50, 75))
             lines.append(f"Test split after / before, {key}: {middle:.2f} ({low:.2f} to {high:.2f}), n {len(ratios)}.")
     held = [yes for row in right for yes in covered({**row, "truth": row["truth"]["effects"]})]
-    return [*lines, f"95 % intervals that hold the truth: {rate(held)}.", ""] if held else lines
+    alike = [yes for row in right for yes in covered({**row, "truth": comparable(row)})]
+    text = f"95 % intervals that hold the truth: {rate(held)}; of numbers that mean the same in both: {rate(alike)}."
+    return [*lines, text, ""] if held else lines
 
 
 def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from real_like.score import RIGHT, judge, ratio_of, wilson
+from real_like.score import EQUIVALENT, RIGHT, judge, ratio_of, wilson
 from render_results import record
 
 LARGE_RATIO = 300**0.5
@@ -64,12 +64,28 @@ def _added(who: str, named: Sequence[Row]) -> Iterator[Row]:
             "met": middle <= MOST_RATIO,
             "note": f"median of {len(ratios)}, half lie within {spread[0]:.2f} to {spread[1]:.2f}",
         }
-    held = [yes for row in added for yes in covered({**row, "truth": row["truth"]["effects"]})]
-    if held:
-        yield {
-            **_figure(who, "real-like, 95 % intervals of added parameters that contain the true value", held,
-                      wilson(sum(held), len(held)), "90 to 99 %", 0.9 <= sum(held) / len(held) <= 0.99, ""),
-        }  # fmt: skip
+    text = "real-like, 95 % intervals of added parameters that contain the true value"
+    for more, truth in (("", lambda row: row["truth"]["effects"]), (", where both mean the same", comparable)):
+        held = [yes for row in added for yes in covered({**row, "truth": truth(row)})]
+        if held:
+            met = 0.9 <= sum(held) / len(held) <= 0.99
+            yield _figure(who, text + more, held, wilson(sum(held), len(held)), "90 to 99 %", met, "")
+
+
+def comparable(row: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the hidden effects of a row whose numbers mean the same in the truth and in what was named.
+
+    Left out are laws with other constants (the reach of a magnet), and what a session's own scale of lengths changes:
+    the tracks then carry the effect and the mean of the scales.
+    """
+    constants = {one["effect"]: one["constants"] for one in row["found"]["ranking"]}
+    scaled = EQUIVALENT[0] if "scale" in row["truth"]["errors"]["carried"] else set()
+
+    def same(effect: dict[str, Any]) -> bool:
+        given = constants.get(effect["name"], {})
+        return all(abs(effect["values"].get(name, value) - value) < 1e-3 * abs(value) for name, value in given.items())
+
+    return [effect for effect in row["truth"]["effects"] if effect["name"] not in scaled and same(effect)]
 
 
 def _right(judged: Sequence[tuple[Row, Row]], row: str) -> list[bool]:

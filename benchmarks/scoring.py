@@ -89,9 +89,12 @@ class Judge:
         return rows
 
     def parameter_errors(self, parameters: dict[str, float]) -> dict[str, float]:
-        """Return relative errors (estimate / truth - 1) of the parameters that the truth has and that are not 0."""
+        """Return relative errors (estimate / truth - 1) of the parameters that the truth has and that are not 0.
+
+        A centre of mass of 1e-17 m is 0 but for rounding.
+        """
         true = true_parameters(self.truth)
-        return {name: value / true[name] - 1 for name, value in parameters.items() if true.get(name)}
+        return {name: value / true[name] - 1 for name, value in parameters.items() if abs(true.get(name, 0.0)) > 1e-12}
 
     def _images(self, prediction: Prediction, episode: TestEpisode) -> dict[str, float]:
         if self.videos is None:

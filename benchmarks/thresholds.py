@@ -40,7 +40,7 @@ from hidden_effects import Case, cases, make_capture
 from store import Store
 from thresholds_page import groups
 
-GROUPS = {"sliding": "sliding", "impact": "impact", "friction_consistency": "friction", "segments": "segments"}
+GROUPS = {"sliding": "sliding", "impact": "impact", "segments": "segments"}
 """Group of the thresholds of each contact test, by its name."""
 STATISTICS: dict[str, Callable[[Evidence], float]] = {
     "sliding.score": lambda one: one.score,
@@ -54,18 +54,13 @@ STATISTICS: dict[str, Callable[[Evidence], float]] = {
     "impact.size": lambda one: one.size,
     "impact.explained": lambda one: one.share,
     "impact.gain_t": lambda one: one.gain_t,
-    "friction.score": lambda one: one.score,
-    "friction.resolved": lambda one: one.share,
-    "segments.score": lambda one: one.score,
     "segments.gain_t": lambda one: one.gain_t,
     "segments.agreed_score": lambda one: one.score,
-    "segments.alone_score": lambda one: one.score,
 }
 """Statistic of each threshold of a contact test that is a minimum, of the selected effect."""
 LOOSE = {
     "sliding": {"score_sure": 0.0},
     "impact": {"score": -math.inf, "size": 0.0, "explained": -math.inf},
-    "friction": {"score": 0.0},
 }
 """Values at which a test fits candidates that it need not look at with the thresholds in use."""
 

@@ -8,10 +8,10 @@ and orientations are measured, in angles over the slow error about an axis. Look
 - effects of contact: all of the episodes that begin on the ground (slides, a ball's rolls); for restitution and
   adhesion 0.2 s from the first touch on, since a tumbling body forgets where it came from;
 
-the ratio of a capture is that of its second strongest training episode, of the strongest where fewer than three are
-looked at. No draw is discarded: where a ratio cannot be
-reached (a friction cannot be negative), the effect has its largest or smallest size and the truth the ratio that it
-reached.
+what comes with an effect, as the drag with the wind, is in both motions, or the drag alone would reach the ratio of a
+wind of millimetres in a second. The ratio of a capture is that of its second strongest training episode, of the
+strongest where fewer than three are looked at. No draw is discarded: where a ratio cannot be reached (a friction cannot
+be negative), the effect has its largest or smallest size and the truth the ratio that it reached.
 
 Sizes of effects of contact are bounded by what surfaces do. Below: friction of one pair of surfaces differs by 5 % and
 more from day to day and place to place (measured pushes of one plate on one board: 0.289 to 0.326, docs/real-data.md),
@@ -93,8 +93,9 @@ def sized_effect(name: str, bench: Bench, seed: Sequence[int]) -> Sized:
     def drawn(size: float) -> Hidden:
         return entry.draw(bench.thing, size, np.random.default_rng([*seed, 2]))
 
-    looked_at = _episodes(name, bench)
-    plain = [bench.simulate(bench.world, [], start, bench.length_s) for start in looked_at]
+    looked_at, along = _episodes(name, bench), [drawn(0.0)] if drawn(min(large, most)).comes_with else []
+    beside = build(bench.world, along)
+    plain = [bench.simulate(beside, along, start, bench.length_s) for start in looked_at]
     windows = [_window(name, motion, bench.length_s) for motion in plain]
     size, best = min(large, most), (np.inf, 0.0, 0.0)
     for _ in range(_STEPS):

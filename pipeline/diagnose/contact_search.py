@@ -1,8 +1,13 @@
 """Search for a missing effect in contact, and separation of flight equals by the contact data.
 
 The tests run in the order of what they assume: sliding segments, where the contact law hardly matters; impacts of a
-ball, which need no contact law; friction in sliding against friction in impacts; and last the contact segments under
-the model's contact law. The first that selects an effect ends the search.
+ball, which need no contact law; and last the contact segments under the model's contact law, which confirm what slides
+show. The first that selects an effect ends the search.
+
+The friction of slides is not compared with that of impacts, although a ground that attracts the body makes the former
+larger: laws of contact differ as much. Where friction acts on the whole impulse it takes mu (1 + e) v off a sliding
+contact, where restitution is applied after friction mu v alone (Rapier 0.36.1, measured with e of 0, 0.5 and 0.8: 1.00,
+0.66 and 0.55 of the friction).
 """
 
 from __future__ import annotations
@@ -17,7 +22,6 @@ from ..segments.prepare import Prepared
 from ..segments.segments import Segments
 from ..segments.sliding_fit import StartedSliding
 from .contact_tests.contact_test import ContactData, ContactTest, selected
-from .contact_tests.friction_consistency import FrictionConsistencyTest
 from .contact_tests.impact import ImpactTest
 from .contact_tests.segments import SegmentsTest
 from .contact_tests.sliding import SlidingTest
@@ -27,7 +31,7 @@ from .evidence import Evidence
 from .flight_equals import resolved_flight
 from .thresholds import THRESHOLDS
 
-TESTS: tuple[ContactTest, ...] = (SlidingTest(), ImpactTest(), FrictionConsistencyTest(), SegmentsTest())
+TESTS: tuple[ContactTest, ...] = (SlidingTest(), ImpactTest(), SegmentsTest())
 """The contact tests in the order in which they run."""
 
 
@@ -127,6 +131,7 @@ def with_contact(
 
 def _limits(data: ContactData, candidates: Sequence[Candidate]) -> list[DetectionLimit]:
     """Return the detection limits in sliding segments; effects that only measured impacts show are left out."""
-    unseen, scores = THRESHOLDS.segments.in_impacts_alone, (THRESHOLDS.sliding.score, THRESHOLDS.sliding.score_flexible)
+    limits = THRESHOLDS.sliding
+    unseen, scores = limits.in_impacts_alone, (limits.score, limits.score_flexible)
     asked = [c for c in candidates if not data.earlier.get("impact") or c.effect.name not in unseen]
     return detection_limits(data.sliding, data.world, asked, scores, data.prepared.has_orientation, unseen)

@@ -29,6 +29,9 @@ from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.segments
 
+SCALE = "length_scale"
+"""Name of the effect of which each session may have a value of its own."""
+
 Array = NDArray[np.float64]
 
 
@@ -78,6 +81,7 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
         equals = list(step.equals)
         if step in ambiguous:
             kept, _ = separated(equals, contact, base.world, prepared.groups)
+            kept = _with_scales_of_sessions(kept, equals, prepared.groups)
             equals = _with_aliases(kept, equals)
             final = _replaced(final, step.best, equals[0])
         chosen.append(tuple(equals))
@@ -98,6 +102,18 @@ def _is_asked(step: SelectionStep, steps: Sequence[SelectionStep]) -> bool:
     drag = any("drag" in one.candidate.effect.provides for one in step.equals)
     others = (one for other in steps if other is not step for one in other.equals)
     return not (drag and any("drag" in one.candidate.effect.needs for one in others))
+
+
+def _with_scales_of_sessions(
+    kept: Sequence[Evidence], equals: Sequence[Evidence], groups: Sequence[int]
+) -> list[Evidence]:
+    """Return the equals that contact admits, with a scale of lengths where episodes belong to several sessions.
+
+    Each session may have a scale of its own, of which flights show the mean; one scale for all is then as wrong in
+    contact as none.
+    """
+    own = [one for one in equals if one.name == SCALE and one not in kept]
+    return [*kept, *own] if len(set(groups)) > 1 else list(kept)
 
 
 def fitted_contact(prepared: Prepared, world: World) -> tuple[Refit, Segments] | None:

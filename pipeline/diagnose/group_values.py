@@ -61,6 +61,15 @@ class _Fitted:
     """The same with one value for all groups."""
     by_flight: Array
     """Chi2 of each flight (B,)."""
+    twins: tuple[tuple[Candidate, dict[int, Array]], ...] = ()
+    """Effects that do the same in flight, with parameters (k,) by group."""
+    beside: int = 0
+    """Number of parameters of the other selected effects."""
+
+    @property
+    def place(self) -> _Place:
+        """The place in which it is."""
+        return _Place(replaces=self.replaces, world=self.world, flight=self.flight, beside=self.beside)
 
     @property
     def mean(self) -> Array:
@@ -133,9 +142,11 @@ def with_group_values(
     }
     before = refit([flight], world, []).cost / scatter + penalty * sum(sizes.values())
     equals = _likeliest([one for place in _places(world, flight, sizes) for one in _fits(search, place)], before)
-    if not equals:
+    equals = [*_with_twins(search, equals[0]), *equals[1:]] if equals else []
+    if not 0 < len(equals) <= LIMITS.most_equals:
         return steps, world, flight
-    best = equals[0]
+    best = min(equals, key=lambda one: one.cost)
+    equals = [best, *(one for one in equals if one is not best)]
     evidence = tuple(_evidence(one, before - best.cost - (one.cost - best.cost), penalty) for one in equals)
     step = SelectionStep(evidence, evidence, True, own_std=float(best.spread[0]))
     kept = [one for one in steps if one.flagged and one.best.name != best.replaces]
@@ -154,6 +165,11 @@ def _likeliest(found: Sequence[_Fitted], before: float) -> list[_Fitted]:
         return []
     helping = sorted((one for one in found if one is not best and one.cost < before), key=lambda one: one.cost)
     return [best, *(one for one in helping if _unproven(best, one))]
+
+
+def _with_twins(search: _Search, one: _Fitted) -> list[_Fitted]:
+    """Return an effect and those that do the same in flight, refitted."""
+    return [one, *(_fitted(search, one.place, candidate, values) for candidate, values in one.twins)]
 
 
 def _places(world: World, flight: Segments, sizes: Mapping[str, int]) -> Iterator[_Place]:
@@ -205,8 +221,11 @@ def _fits(search: _Search, place: _Place) -> list[_Fitted]:
     linear = linearize(flight, world, variants, search.prepared.groups, robust=False)
     scored = [one for variant in variants if (one := _scored(search, linear, variant)) is not None]
     scored.sort(key=lambda one: (-one.gain, one.variant.place))
-    likeliest = _unlike(linear, scored)[:REFITTED]
-    return [_fitted(search, place, kept[one.variant.place], one.values) for one in likeliest]
+    found = []
+    for one, twins in _unlike(linear, scored)[:REFITTED]:
+        fitted = _fitted(search, place, kept[one.variant.place], one.values)
+        found.append(replace(fitted, twins=tuple((kept[twin.variant.place], twin.values) for twin in twins)))
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,17 +265,23 @@ def _fitted(search: _Search, place: _Place, candidate: Candidate, start: dict[in
         cost=float(by_flight.sum()) / search.scatter + beside + own * len(values) + odds,
         by_flight=by_flight,
         alone=alone / search.scatter + beside + own,
+        beside=place.beside,
     )
 
 
-def _unlike(linear: Linearization, scored: Sequence[_Scored]) -> list[_Scored]:
-    """Return the effects without those that do the same as one before them."""
-    found: list[_Scored] = []
+def _unlike(linear: Linearization, scored: Sequence[_Scored]) -> list[tuple[_Scored, list[_Scored]]]:
+    """Return the effects, each with those after it that do the same with as many parameters."""
+    found: list[tuple[_Scored, list[_Scored]]] = []
     for one in scored:
-        columns = [linear.columns(other.variant.parameters) for other in found]
         mine = linear.columns(one.variant.parameters)
-        if all(canonical_correlation(linear, mine, other) < LIMITS.contained for other in columns):
-            found.append(one)
+        for other, twins in found:
+            columns = linear.columns(other.variant.parameters)
+            if canonical_correlation(linear, mine, columns) >= LIMITS.contained:
+                if len(columns) == len(mine):
+                    twins.append(one)
+                break
+        else:
+            found.append((one, []))
     return found
 
 

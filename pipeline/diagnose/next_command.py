@@ -31,11 +31,15 @@ def next_command(result: DiagnoseResult, model: Path, capture: Path, split: str 
 def successor(model: Path) -> Path:
     """Return the path of the model that follows another one, which does not exist yet: its number is one larger.
 
-    >>> successor(Path("a/m0")), successor(Path("base"))
-    (PosixPath('a/m1'), PosixPath('base-1'))
+    The number is that of a part `m0` of the name, else the one at its end.
+
+    >>> successor(Path("a/m0")), successor(Path("m0_throws7")), successor(Path("base"))
+    (PosixPath('a/m1'), PosixPath('m1_throws7'), PosixPath('base-1'))
     """
-    found = re.fullmatch(r"(.*?)(\d{1,6})", model.name)
-    stem, number = (found[1], int(found[2])) if found else (f"{model.name}-", 0)
-    while (path := model.with_name(f"{stem}{number + 1}")).exists():
+    found = re.fullmatch(r"((?:.*[_-])?m)(\d{1,6})([_-].*)", model.name) or re.fullmatch(
+        r"(.*?)(\d{1,6})()", model.name
+    )
+    stem, number, rest = (found[1], int(found[2]), found[3]) if found else (f"{model.name}-", 0, "")
+    while (path := model.with_name(f"{stem}{number + 1}{rest}")).exists():
         number += 1
     return path

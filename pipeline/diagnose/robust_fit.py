@@ -19,6 +19,7 @@ from ..optimization.least_squares import Descent, Policy, descend
 from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..segments.linearization import Linearization, layout, widths
 from ..segments.segment_fit import robust_excess
+from .falsification import Repetition, repetition
 from .thresholds import THRESHOLDS
 
 Array = NDArray[np.float64]
@@ -43,6 +44,10 @@ class RobustFit:
     """Robust loss plus the cost of the priors."""
     information: Array
     """Information (k, k) with the weights at the minimum."""
+    weight: Array
+    """Robust weight of each segment (B,) at the minimum."""
+    chi2: Array
+    """Chi2 of each segment (B,) at the minimum."""
 
 
 def with_segment_parameters(linear: Linearization) -> Linearization:
@@ -80,9 +85,32 @@ def robust_fit(linear: Linearization, columns: Sequence[int]) -> RobustFit:
         linear: The linearization.
         columns: Columns of the parameters, including the model's.
     """
-    end = _fitted(_RobustProblem(linear, columns, np.ones((1, len(linear.chi2)))))
-    value, information = end.point.values[0].numpy(), end.information()[0].numpy()
-    return RobustFit(tuple(columns), value, float(end.cost[0]), information)
+    problem = _RobustProblem(linear, columns, np.ones((1, len(linear.chi2))))
+    end = _fitted(problem)
+    left = problem.left(end.point.values)
+    return RobustFit(
+        columns=tuple(columns),
+        value=end.point.values[0].numpy(),
+        cost=float(end.cost[0]),
+        information=end.information()[0].numpy(),
+        weight=robust_excess(left)[1][0].numpy(),
+        chi2=left[0].numpy() + linear.dof,
+    )
+
+
+def robust_repetition(linear: Linearization, base: Sequence[int], columns: Sequence[int], tried: int) -> Repetition:
+    """Return whether an effect repeats from episode to episode beyond what the fit with it leaves.
+
+    Args:
+        linear: The linearization.
+        base: Columns of the model's parameters, the first ones, which are fitted jointly.
+        columns: Columns of the effect's parameters.
+        tried: Number of effects that were tried; the p-value is corrected for it.
+    """
+    fit = robust_fit(linear, [*base, *columns])
+    misfit = max(1.0, float(fit.weight @ fit.chi2) / float(fit.weight @ linear.dof))
+    found = repetition(replace(linear, weight=fit.weight), columns, misfit)
+    return replace(found, p_value=min(1.0, tried * found.p_value))
 
 
 def robust_gains(linear: Linearization, base: Sequence[int], columns: Sequence[int]) -> Array:
@@ -135,11 +163,15 @@ class _RobustProblem(Problem):
         )
         self.box = Box(**dict(zip(("low", "high", "centre", "information"), parts, strict=True)))
 
-    def losses(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return loss and robust weight (g, B) of each segment at parameters (g, n)."""
+    def left(self, values: Tensor) -> Tensor:
+        """Return chi2 less the degrees of freedom (g, B) of each segment at parameters (g, n)."""
         own = values[:, self.places]
         moved = (self.information @ own[..., None])[..., 0]
-        return robust_excess(self.excess - 2 * (self.score * own).sum(-1) + (moved * own).sum(-1))
+        return self.excess - 2 * (self.score * own).sum(-1) + (moved * own).sum(-1)
+
+    def losses(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return loss and robust weight (g, B) of each segment at parameters (g, n)."""
+        return robust_excess(self.left(values))
 
     def costs(self, point: Point, rows: Rows) -> Tensor:
         """Return the weighted loss (g,) of all segments."""

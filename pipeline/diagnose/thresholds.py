@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass, field
 
 from ..trajectories.thresholds import BY_ARGUMENT, threshold
-from .contact_thresholds import FrictionThresholds, ImpactThresholds, SegmentsThresholds, SlidingThresholds
+from .contact_thresholds import ImpactThresholds, SegmentsThresholds, SlidingThresholds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +68,14 @@ class FlightThresholds:
         "change of BIC below which a slight effect is named",
         "development, reports 4 to 7",
         "see `slight`",
+    )
+    most_equals: int = threshold(
+        5,
+        "effects",
+        "an effect with a value in each group is named where at most so many do the same: to name everything is to "
+        "name nothing",
+        BY_ARGUMENT,
+        "the largest class that flights cannot tell apart has five; one of 149 nulls of real-like development had nine",
     )
     most_effects: int = threshold(3, "effects", "how many effects are looked for in flight")
     share: float = threshold(
@@ -296,7 +304,6 @@ class Thresholds:
     """Sliding test."""
     impact: ImpactThresholds = field(default_factory=ImpactThresholds)
     """Impact test."""
-    friction: FrictionThresholds = field(default_factory=FrictionThresholds)
     """Friction consistency test."""
     segments: SegmentsThresholds = field(default_factory=SegmentsThresholds)
     """Test in contact segments, and separation of flight equals."""

@@ -151,7 +151,9 @@ def _refuse_floating(world: World, prepared: Prepared, where: str) -> None:
         return
     gap = clearance(world, whole)
     size = min(size_of(world.bodies[k]) for k in world.free)
-    high = prepared.supported & (gap > LIMITS.most_off * size)
+    high = _resting(whole, prepared.supported & (gap > LIMITS.most_off * size), world)
+    if bool(high.any()) and _rests_on_a_tilted_plane(gap[high], whole.position_m[:, :, 0][high], world, size):
+        return
     share = float(high.sum()) / max(float((whole.seen.amax(-1) > 0).sum()), 1.0)
     if share > LIMITS.most_carried:
         raise InputDataError(
@@ -159,6 +161,45 @@ def _refuse_floating(world: World, prepared: Prepared, where: str) -> None:
             f"the ground and does not fall; its size is {1e3 * size:.0f} mm.",
             *_BELONG_TOGETHER,
         )
+
+
+def _resting(whole: Observations, supported: Tensor, world: World) -> Tensor:
+    """Return which supported frames (E, T) belong to stretches in which the body is carried and not thrown back.
+
+    A filter smears a bounce over its window: frames around it are neither flight nor near the ground, but over the
+    whole stretch the velocity along gravity changes far more than that of a body at rest.
+    """
+    up = -world.gravity[0] / world.gravity[0].norm().clamp_min(1e-9)
+    height, resting = whole.position_m[:, :, 0] @ up, torch.zeros_like(supported)
+    for episode, marks in enumerate(supported):
+        frames = torch.nonzero(marks)[:, 0]
+        for run in torch.tensor_split(frames, (torch.nonzero(frames.diff() > 1)[:, 0] + 1).tolist()):
+            if len(run) < LIMITS.least_stretch:
+                continue
+            ends = torch.stack((run[:2], run[-2:]))
+            times, places = whole.times_s[episode, ends], height[episode, ends]
+            speed = places.diff(dim=1)[:, 0] / times.diff(dim=1)[:, 0]
+            lasted = float(times[1].mean() - times[0].mean())
+            resting[episode, run] = abs(float(speed[1] - speed[0])) < 0.5 * float(world.gravity.norm()) * lasted
+    return resting
+
+
+def _rests_on_a_tilted_plane(gap: Tensor, place: Tensor, world: World, size: float) -> bool:
+    """Return whether a body is carried by a ground that is tilted about the origin, which is a named effect.
+
+    Args:
+        gap: Gap to the ground (n,) [m].
+        place: Position of the body (n, 3) [m], world.
+        world: The model's world.
+        size: Size of the body [m].
+    """
+    normal = world.ground_normal
+    assert normal is not None  # without a ground nothing is above it
+    along = place - (place @ normal)[:, None] * normal
+    plane = torch.linalg.lstsq(along, gap, driver="gelsd").solution
+    left = (gap - along @ plane).abs()
+    near = float(torch.quantile(left, 1 - LIMITS.deep_share)) <= LIMITS.most_off * size
+    return float(plane.norm()) <= LIMITS.most_tilt and near
 
 
 def _travel(whole: Observations) -> float:

@@ -334,7 +334,7 @@ def _smeared(whole: Observations, contact: Tensor, noise_model: NoiseModel) -> T
         np.median(np.concatenate([_steps(times, known) for times, known in zip(whole.times_s, seen, strict=True)]))
     )
     memory_s = max((noise.time_s for noise in noise_model if noise.share > LIMITS.filtered), default=0.0)
-    reach_s = min(LIMITS.smeared_times * memory_s, LIMITS.smeared_s)
+    reach_s = min(LIMITS.smeared_times * memory_s, max(LIMITS.smeared_s, LIMITS.filter_frames * step_s))
     reach = max(LIMITS.smeared_frames, math.ceil(reach_s / step_s))
     near = torch.nn.functional.max_pool1d((contact & seen).double()[:, None], 2 * reach + 1, 1, reach)
     return near[:, 0] > 0

@@ -44,6 +44,12 @@ class InputThresholds:
     most_carried: float = threshold(
         0.2, "1", "share of the frames above the ground and not falling: shape or ground are wrong"
     )
+    least_stretch: int = threshold(
+        4,
+        "frames",
+        "fewest in a row that tell a body that is carried from a bounce that a filter smeared",
+        "by argument: two at each end give the velocities",
+    )
     densest_kg_m3: float = threshold(23000.0, "kg/m3", "heaviest body of its shape: osmium", "physical bound")
     alike_sigmas: float = threshold(
         3.0, "sigma", "motions that differ by less are one motion; bodies that move by less stand still"
@@ -119,6 +125,13 @@ class PreparationThresholds:
         "by argument: a filter smears a contact as far as it correlates errors",
     )
     smeared_s: float = threshold(0.04, "s", "longest such time: slower errors come from no filter", BY_ARGUMENT)
+    filter_frames: int = threshold(
+        5,
+        "frames",
+        "the same in frames, where these last longer than `smeared_s`",
+        "by argument: a filter of eleven frames",
+        "a ball at 60 Hz, smoothed over eleven frames: the flights between its bounces were named a pull of the ground",
+    )
     filtered: float = threshold(
         0.95,
         "1",

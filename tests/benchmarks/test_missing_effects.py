@@ -89,3 +89,43 @@ def test_the_generator_does_not_load_what_judges() -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, capture_output=True, text=True, check=True,
                           env={"PYTHONPATH": ":".join([str(BENCHMARKS), *sys.path])})  # fmt: skip
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.evidence
+def test_a_box_turns_in_rapiers_flight_as_its_moments_say() -> None:
+    """Without torques the angular momentum of a box is constant: its colliders must not change its moments."""
+    pytest.importorskip("rapier3d")
+    from cgwm.datasets.synthetic.hidden_effects.mechanics import Mechanics, Start
+    from real_like.engines import rapier_engine
+    from scipy.spatial.transform import Rotation
+
+    case = next(one for one in real_cases("development", 40, 0) if one.group == "rapier" and one.thing == "cube")
+    thing = case.body_case().drawn_thing()
+    spin = np.array([3.0, -6.0, 9.0])
+    start = Start(np.array([0.0, 0, 9]), np.array([0.8, 0.2, -0.4, 0.4]), np.zeros(3), spin)
+    world = Mechanics.of(thing, 1)
+    motion = rapier_engine.simulate(world, [], start, 0.5)
+    turn = Rotation.from_quat(motion.quat_wxyz, scalar_first=True)
+    omega = (turn[:-1].inv() * turn[1:]).as_rotvec() / rapier_engine.STEP_S
+    middle = turn[:-1] * Rotation.from_rotvec(0.5 * omega * rapier_engine.STEP_S)
+    momentum = middle.apply(omega @ world.inertia_kg_m2.T)
+    assert np.linalg.norm(momentum - momentum[0], axis=1).max() < 3e-3 * np.linalg.norm(momentum[0])
+
+
+@pytest.mark.evidence
+def test_the_size_of_a_wind_is_what_it_adds_to_its_drag() -> None:
+    from cgwm.datasets.synthetic.hidden_effects import EFFECTS, mujoco_engine
+    from cgwm.datasets.synthetic.hidden_effects.mechanics import Mechanics
+    from cgwm.datasets.synthetic.hidden_effects.protocol import draw_start
+    from real_like.sizes import Bench, sized_effect
+
+    case = next(one for one in real_cases("development", 0, 90) if "wind" in one.effects and one.engine == "mujoco")
+    thing = case.body_case().drawn_thing()
+    starts = [("throw", draw_start(thing, "throw", case.rng(f"start {k}"))) for k in range(3)]
+    bench = Bench(
+        thing=thing, world=Mechanics.of(thing, 1), simulate=mujoco_engine.simulate, episodes=starts, length_s=0.6,
+        errors=draw_errors(case.rng("errors"), 100.0), turned=False,
+    )  # fmt: skip
+    found = sized_effect("wind", bench, [5])
+    assert found.ratio == pytest.approx(found.drawn_ratio, rel=0.2)
+    assert found.size > 10e-3 * EFFECTS["wind"].large[thing.kind]

@@ -1,1 +1,1 @@
-"""Tests for a missing contact effect: sliding, impacts, friction consistency, and contact segments."""
+"""Tests for a missing contact effect: sliding, impacts, and contact segments."""

@@ -1,8 +1,10 @@
-"""Test in contact segments: a missing contact effect under the model's contact law.
+"""Test in contact segments: does the model's contact law confirm an effect that slides or impacts have shown?
 
-No contact law is exact, so a textbook p-value finds an effect in most data without one. Therefore every contact segment
-has its own deviations of the contact parameters, segments that no candidate explains are downweighted, the effect has
-to improve held-out episodes, and the threshold is the score that data without an effect reach.
+No contact law is exact, and its error is the same in all episodes: restitution that depends on the speed, a pull at the
+ground or a friction by direction describe how another law differs from the model's, repeat from episode to episode, and
+predict held-out ones. Segments alone therefore name nothing. They confirm an effect of one parameter that ranks first
+among slides, too. Every segment has its own deviations of the contact parameters, segments that no candidate explains
+are downweighted, and the effect has to improve held-out episodes and to exceed its scatter between episodes.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ from ...segments.candidates import Candidate, Variant, base_parameters, base_val
 from ...segments.linearization import linearize
 from ...segments.segment_fit import refit
 from ...segments.segments import Segments
+from ..effect_selection import repeats
 from ..evidence import Evidence
-from ..robust_fit import RobustFit, robust_fit, robust_gains, with_segment_parameters
+from ..robust_fit import RobustFit, robust_fit, robust_gains, robust_repetition, with_segment_parameters
 from ..thresholds import THRESHOLDS, SegmentsThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of, variant_of
 
@@ -63,9 +66,11 @@ class SegmentsTest(ContactTest):
             found.append(_judged(candidate, variant, fit, without, penalty, tries[variant.place]))
         results = []
         for one in ranked(found):
-            gains = robust_gains(linear, base, linear.columns(variant_of(one, variants, candidates).parameters))
+            columns = linear.columns(variant_of(one, variants, candidates).parameters)
+            gains = robust_gains(linear, base, columns)
             score = one.score if one.test.admissible else -math.inf
-            results.append(replace(one, gains=tuple(gains.tolist()), score=score))
+            repeated = robust_repetition(linear, base, columns, len(candidates)) if score > 0 else None
+            results.append(replace(one, gains=tuple(gains.tolist()), score=score, repetition=repeated))
         return ranked(results)
 
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
@@ -73,18 +78,15 @@ class SegmentsTest(ContactTest):
         return (Lead(share=self.limits.lead_share, rival=Bar(gain_t=self.limits.gain_t)),)
 
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
-        """Return the bar, which is higher for an effect that sliding segments would show; none if they contradict."""
-        best, sliding = equals[0], data.earlier.get("sliding", ())
-        near = best.candidate.effect.phase != "contact"
-        if near and (data.flown or not data.explained):  # flights, which show it too, did not fit the model
-            return (Bar(score=self.limits.alone_score, gain_t=self.limits.gain_t),)
-        if near or best.name in self.limits.in_impacts_alone:
-            return (Bar(score=self.limits.score, gain_t=self.limits.gain_t),)
-        if not sliding:
-            return (Bar(score=self.limits.alone_score, gain_t=self.limits.gain_t),)
-        first = next((one for one in sliding if one.test.admissible), None)
-        agreed = first is not None and first.name == best.name and first.score > self.limits.agreed_score
-        return (Bar(score=self.limits.agreed_score, gain_t=self.limits.gain_t),) if agreed else ()
+        """Return the bar of an effect that slides have shown before; none for any other one."""
+        best = equals[0]
+        few = len(best.candidate.effect.parameters) <= THRESHOLDS.sliding.few_parameters
+        if not few or not repeats(best, 1):
+            return ()
+        slides = next((one for one in data.earlier.get("sliding", ()) if one.test.admissible), None)
+        if slides is None or slides.name != best.name or slides.score <= self.limits.agreed_score:
+            return ()
+        return (Bar(score=self.limits.agreed_score, gain_t=self.limits.gain_t),)
 
     def added(self, data: ContactData, best: Evidence) -> tuple[World, Evidence] | None:
         """Return the world refitted with the effect, and the evidence with its estimates; None if it may be zero."""

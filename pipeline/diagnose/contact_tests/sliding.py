@@ -90,6 +90,8 @@ class SlidingTest(ContactTest):
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bars for an effect, and for one that leaves next to nothing unexplained."""
         best = equals[0]
+        if best.name in self.limits.higher_at_rest and (best.test.estimate < 0).any():
+            return ()
         parameters = len(best.candidate.effect.parameters)
         flexible = parameters > self.limits.few_parameters
         mapped = any(len(one.candidate.effect.parameters) > self.limits.many_parameters for one in equals)

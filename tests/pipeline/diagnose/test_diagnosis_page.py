@@ -119,6 +119,8 @@ def test_the_next_model_has_a_number_that_is_free(tmp_path: Path) -> None:
     (tmp_path / "m1").mkdir()
     assert successor(tmp_path / "m0") == tmp_path / "m2"
     assert successor(tmp_path / "base") == tmp_path / "base-1"
+    assert successor(tmp_path / "m0_throws7") == tmp_path / "m1_throws7"  # the 7 is that of the throws
+    assert successor(tmp_path / "throws7_m0") == tmp_path / "throws7_m1"
 
 
 def test_an_experiment_is_drawn_as_it_would_fly() -> None:

@@ -79,6 +79,43 @@ def test_a_body_of_another_shape_is_told() -> None:
         check_observability(small, prepare(small, episodes), "here")
 
 
+def test_bounces_that_a_filter_smeared_do_not_float() -> None:
+    """At 60 Hz a window of eleven frames lifts a bounce by centimetres, in frames that are no flight."""
+    world = world_with("ball")
+
+    def smooth(track: Track) -> Track:
+        assert track.quat_wxyz is not None
+        quat = savgol_filter(track.quat_wxyz, 11, 2, axis=0)
+        quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+        return replace(track, position_m=savgol_filter(track.position_m, 11, 2, axis=0), quat_wxyz=quat)
+
+    fallen = tosses(world, 3, count=3, duration_s=0.5, rate_hz=60.0, height_m=(0.3, 0.4), lift_m_s=(0.0, 0.01))
+    episodes = changed(fallen, smooth)
+    prepared = prepare(world, episodes)
+    high = prepared.supported & (clearance(world, prepared.observations) > LIMITS.most_off * 0.04)
+    assert float(high.sum()) > LIMITS.most_carried * float(prepared.observations.seen.amax(-1).sum())
+    check_observability(world, prepared, "here")
+
+
+def test_a_ball_that_rolls_up_a_tilted_frame_does_not_float() -> None:
+    world, times, rng = world_with("ball"), np.arange(100) / 100, np.random.default_rng(0)
+    slope, speed = 0.02, (0.8, 1.0, 1.2)
+    quiet = NOISE[0] * rng.standard_normal((3, 100, 3))
+
+    def rolling(v: float, k: int, lift: float) -> Track:
+        place = np.stack((v * times, 0.1 * k + 0 * times, 0.04 + lift + slope * v * times), 1) + quiet[k]
+        turn = np.stack((np.cos(v * times / 0.08), 0 * times, np.sin(v * times / 0.08), 0 * times), 1)
+        return Track(times, place, turn)
+
+    def checked(lift: float) -> None:
+        episodes = [(f"{k}", {"ball": rolling(v, k, lift)}) for k, v in enumerate(speed)]
+        check_observability(world, prepare(world, episodes), "here")
+
+    checked(0.0)
+    with pytest.raises(InputDataError, match="above the ground and does not fall"):
+        checked(0.03)
+
+
 def test_a_tilted_frame_is_no_other_shape() -> None:
     """Three degrees of tilt put a body a quarter of a metre away 13 mm under the ground: that is for the diagnosis."""
     world = world_with("cube")

@@ -1,0 +1,108 @@
+"""Evidence of contact that repeats: an effect in every episode against one episode's, and equals by sessions."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
+from cgwm.pipeline.diagnose.evidence import Evidence
+from cgwm.pipeline.diagnose.flight_equals import _with_scales_of_sessions
+from cgwm.pipeline.diagnose.group_values import _Scored, _unlike
+from cgwm.pipeline.diagnose.robust_fit import robust_repetition
+from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.physics.effects import load_effect
+from cgwm.pipeline.physics.parameters import Parameter
+from cgwm.pipeline.segments.candidates import Candidate, Variant
+from cgwm.pipeline.segments.linearization import Linearization
+from numpy.typing import NDArray
+
+
+def linear(effect: NDArray[np.float64], noise: float = 1.0) -> Linearization:
+    """Forty contact segments of eight episodes, in which one parameter beside the friction has the values `effect`."""
+    rng, count = np.random.default_rng(0), 40
+    episode = np.arange(count) % len(effect)
+    rows = rng.standard_normal((count, 30, 2))
+    seen = rows @ [0.3, 0.0] + rows[..., 1] * effect[episode, None] + noise * rng.standard_normal((count, 30))
+    parameters = tuple(
+        Parameter(name=n, unit="1", prior=(0.0, 5.0), bounds=(-9.0, 9.0), logarithmic=False, reveals="") for n in "fe"
+    )
+    return Linearization(
+        parameters=parameters,
+        base=1,
+        information=np.einsum("bti,btj->bij", rows, rows),
+        score=np.einsum("bti,bt->bi", rows, seen),
+        weight=np.ones(count),
+        episode=episode,
+        group=np.zeros(count, np.int64),
+        prior=np.array([1 / 25, 0.0]),
+        chi2=(seen**2).sum(1),
+        dof=np.full(count, 30.0),
+    )
+
+
+def test_an_effect_of_all_episodes_repeats_and_one_episodes_does_not() -> None:
+    every = robust_repetition(linear(np.full(8, 0.5)), [0], [1], 10)
+    assert every.p_value < 1e-4
+    assert every.without_best < 1e-4
+    assert every.scatter < 1.5
+    single = robust_repetition(linear(np.array([3.0, 0, 0, 0, 0, 0, 0, 0])), [0], [1], 10)
+    assert single.without_best > 0.05
+    assert single.scatter > 2
+    signs = robust_repetition(linear(np.array([0.5, -0.5] * 4)), [0], [1], 10)
+    assert signs.p_value > 0.1
+
+
+def test_what_another_law_leaves_is_scatter() -> None:
+    """Noise three times as large as stated is the law's own misfit: its square divides the evidence."""
+    quiet, rough = (robust_repetition(linear(np.full(8, 0.15), noise), [0], [1], 1) for noise in (1.0, 3.0))
+    assert rough.p_value > 10 * quiet.p_value
+
+
+def evidence(name: str, values: tuple[float, ...] = (1.0,)) -> Evidence:
+    size = len(values)
+    test = ScoreTest(
+        statistic=1.0, dof=size, p_value=1.0, estimate=np.array(values), covariance=np.eye(size), admissible=True
+    )  # fmt: skip
+    return Evidence(candidate=Candidate(name, load_effect(name)), constants={}, test=test, p_value=1.0, score=500.0)
+
+
+@pytest.mark.parametrize(("rise", "count"), [(0.2, 2), (-0.2, 0)])
+def test_friction_that_is_lower_at_rest_is_the_smeared_end_of_a_slip(rise: float, count: int) -> None:
+    data: Any = SimpleNamespace(flown=False, explained=True)
+    assert len(SlidingTest().bars([evidence("stribeck_friction", (rise,))], data)) == count
+
+
+def test_contact_rules_no_scale_of_lengths_out_where_sessions_may_have_their_own() -> None:
+    scale, clock = evidence("length_scale"), evidence("clock_scale")
+    assert _with_scales_of_sessions([clock], [scale, clock], (0, 1, 0)) == [clock, scale]
+    assert _with_scales_of_sessions([clock], [scale, clock], (0, 0, 0)) == [clock]
+
+
+def test_effects_that_do_the_same_are_kept_beside_the_first() -> None:
+    rows = np.random.default_rng(1).standard_normal((6, 20, 2))
+    rows = np.concatenate((rows, 2 * rows[..., :1]), -1)  # the third does what the first does
+    names = ("a.x", "b.x", "c.x")
+    parameters = tuple(
+        Parameter(name=n, unit="1", prior=(0.0, 5.0), bounds=(-9.0, 9.0), logarithmic=False, reveals="") for n in names
+    )
+    whole = Linearization(
+        parameters=parameters,
+        base=0,
+        information=np.einsum("bti,btj->bij", rows, rows),
+        score=np.zeros((6, 3)),
+        weight=np.ones(6),
+        episode=np.arange(6),
+        group=np.arange(6) % 2,
+        prior=np.zeros(3),
+        chi2=np.zeros(6),
+        dof=np.full(6, 20.0),
+    )
+
+    def variant(name: str) -> Any:
+        effect = SimpleNamespace(name=name[0], parameters=[SimpleNamespace(name="x")])
+        return Variant(names.index(name), SimpleNamespace(effect=effect), {})  # pyright: ignore[reportArgumentType]
+
+    scored = [_Scored(gain=3.0 - k, variant=variant(name), values={}) for k, name in enumerate(names)]
+    found = [(one.variant.place, [twin.variant.place for twin in twins]) for one, twins in _unlike(whole, scored)]
+    assert found == [(0, [2]), (1, [])]
