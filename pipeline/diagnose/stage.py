@@ -60,7 +60,7 @@ from .sparse_regression import residual_law
 from .thresholds import THRESHOLDS
 from .unlike_episodes import unlike_episodes, unlike_warnings
 from .verdict import Findings, find
-from .wording import law_warnings, motion_warnings, sentence, size_warnings, unseen_motion
+from .wording import law_warnings, motion_warnings, noisy_warnings, sentence, size_warnings, unseen_motion
 
 JOINTED = (
     "of the jointed body '{name}' the motion of the centre of mass of its links was examined, in flight alone: what "
@@ -204,7 +204,8 @@ def report_and_findings(
     _, refused = admissible(world, library, prepared.has_orientation, prepared.observations.spin_rad_s is not None)
     clear = prepared.airborne & (prepared.observations.seen.amax(-1) > 0)
     seen = int((prepared.observations.seen.amax(-1) > 0).sum())
-    warnings = [*prepared.warnings, *motion_warnings(prepared), *law_warnings(findings), *size_warnings(findings)]
+    warnings = [*prepared.warnings, *motion_warnings(prepared), *noisy_warnings(prepared, findings)]
+    warnings += [*law_warnings(findings), *size_warnings(findings)]
     law = _law(findings.flight.prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []

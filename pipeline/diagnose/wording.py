@@ -133,6 +133,25 @@ def motion_warnings(prepared: Prepared) -> list[str]:
     return []
 
 
+def noisy_warnings(prepared: Prepared, findings: Findings) -> list[str]:
+    """Return a warning that names the episodes of which no flight was searched, since they are noisier than all others.
+
+    Args:
+        prepared: The episodes as they were given.
+        findings: The findings, whose flights are those that were searched.
+    """
+    searched = findings.flight.prepared.flight
+    if prepared.flight is None or searched is None:
+        return []
+    lost = {item.episode for item in prepared.flight.items} - {item.episode for item in searched.items}
+    if not lost:
+        return []
+    names = ", ".join(prepared.names[k] for k in sorted(lost))
+    return [
+        f"{names}: left out of the search in flight, where no effect brings the flights as near as those of others."
+    ]
+
+
 def size_warnings(findings: Findings) -> list[str]:
     """Return a warning for each selected effect that is larger than instruments or nature usually have it."""
     found = []

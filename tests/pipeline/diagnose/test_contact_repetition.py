@@ -11,6 +11,7 @@ from cgwm.pipeline.diagnose.flight_equals import _with_scales_of_sessions
 from cgwm.pipeline.diagnose.group_values import _Scored, _unlike
 from cgwm.pipeline.diagnose.robust_fit import robust_repetition
 from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.diagnose.wording import noisy_warnings
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.parameters import Parameter
 from cgwm.pipeline.segments.candidates import Candidate, Variant
@@ -106,3 +107,14 @@ def test_effects_that_do_the_same_are_kept_beside_the_first() -> None:
     scored = [_Scored(gain=3.0 - k, variant=variant(name), values={}) for k, name in enumerate(names)]
     found = [(one.variant.place, [twin.variant.place for twin in twins]) for one, twins in _unlike(whole, scored)]
     assert found == [(0, [2]), (1, [])]
+
+
+def test_episodes_of_which_no_flight_was_searched_are_named() -> None:
+    def flights(*episodes: int) -> Any:
+        return SimpleNamespace(items=[SimpleNamespace(episode=k) for k in episodes])
+
+    prepared: Any = SimpleNamespace(names=("a", "b", "c"), flight=flights(0, 0, 1, 2))
+    findings: Any = SimpleNamespace(flight=SimpleNamespace(prepared=SimpleNamespace(flight=flights(0, 2))))
+    assert [text.split(":")[0] for text in noisy_warnings(prepared, findings)] == ["b"]
+    findings.flight.prepared.flight = flights(0, 1, 2)
+    assert noisy_warnings(prepared, findings) == []
