@@ -163,7 +163,7 @@ def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
         assert contact.size == 0 or len(flies) < int(sharp.airborne[episode].sum())
 
 
-@pytest.mark.parametrize(("share", "reach"), [(0.99, 4), (0.9, 3)])
+@pytest.mark.parametrize(("share", "reach"), [(0.99, 5), (0.9, 3)])
 def test_errors_with_a_white_part_come_from_no_filter_which_would_smear_contacts(share: float, reach: int) -> None:
     sharp, _ = ready("ball", {}, None)
     contact = torch.zeros_like(sharp.airborne)
