@@ -14,17 +14,8 @@ _SMALL_ANGLE2 = 1e-8
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """Return the quaternion product a b of quaternions (..., 4): the rotation by b, then by a."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        -1,
-    )
+    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    return torch.cat((aw * bw - (av * bv).sum(-1, keepdim=True), aw * bv + bw * av + cross(av, bv)), -1)
 
 
 def quat_conjugate(quat_wxyz: Tensor) -> Tensor:
@@ -132,9 +123,9 @@ def quat_rotate(quat_wxyz: Tensor, vector: Tensor) -> Tensor:
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
     """Return the cross product of vectors (..., 3); batch dimensions broadcast."""
-    ax, ay, az = a.unbind(-1)
-    bx, by, bz = b.unbind(-1)
-    return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), -1)
+    if a.dim() != b.dim():
+        a, b = torch.broadcast_tensors(a, b)
+    return torch.linalg.cross(a, b)
 
 
 def geodesic_angle(a_wxyz: Tensor, b_wxyz: Tensor) -> Tensor:

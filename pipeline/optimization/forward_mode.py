@@ -32,6 +32,7 @@ _MIXED = {
     torch.Tensor.__matmul__,
     torch.Tensor.__rmatmul__,
     torch.atan2,
+    torch.linalg.cross,
     torch.maximum,
     torch.minimum,
     torch.where,

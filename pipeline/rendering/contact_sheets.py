@@ -19,6 +19,8 @@ TILE_WIDTH = 264
 """Width of a frame in a report [px]; six fit side by side on a page of 1100 px."""
 SHEET_BYTES = 3_000_000
 """Maximum size of a contact sheet in a model [bytes]."""
+PNG_LEVEL = 6
+"""Effort of compression: 9 takes six times as long for 3 % fewer bytes."""
 _ASPECT = 4 / 3
 _MARGIN = 0.2
 _COLUMNS = 4
@@ -178,7 +180,7 @@ def jpeg_uri(image: Image, quality: int = 78) -> str:
 
 def png_uri(image: Image) -> str:
     """Return an RGB image as a data URI (PNG)."""
-    return _uri(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9], "image/png")
+    return _uri(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL], "image/png")
 
 
 def encoded(image: Image, suffix: str, options: Sequence[int] = ()) -> bytes:
@@ -191,7 +193,7 @@ def small_png(image: Image, most_bytes: int = 400_000) -> bytes:
     for bits in range(8, 3, -1):
         step = 1 << (8 - bits)
         reduced = image if bits == 8 else np.minimum(cv2.medianBlur(image, 3) // step * step + step // 2, 255)
-        data = encoded(np.asarray(reduced, np.uint8), ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        data = encoded(np.asarray(reduced, np.uint8), ".png", [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
         if len(data) <= most_bytes:
             return data
     height, width = image.shape[:2]

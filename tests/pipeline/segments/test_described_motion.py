@@ -1,13 +1,16 @@
 """A model that describes nothing is told first: nothing touches what should, or a resting body is nearer."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics.world import Body, World
-from cgwm.pipeline.segments.described_motion import _sentence, _supported, not_described
+from cgwm.pipeline.segments import described_motion
+from cgwm.pipeline.segments.described_motion import LIMITS, _Predicted, _sentence, _supported, not_described
 from cgwm.pipeline.trajectories.initial_state import clearance
 from cgwm.pipeline.trajectories.observations import Observations
 from helpers.diagnosis_data import NOISE, tosses, world_with
@@ -96,3 +99,123 @@ def test_heights_that_stay_level_or_turn_at_once_show_a_support() -> None:
 def test_the_sentence_says_what_describes_the_motion_better(numbers: tuple, said: str) -> None:
     sentence = _sentence(*numbers, "a wrong ground")
     assert sentence == f"The model does not describe this motion: {said}. Likely cause: a wrong ground."
+
+
+SIZE_M = 0.07
+
+
+def predicted(model: torch.Tensor, measured: torch.Tensor, free: torch.Tensor | None = None) -> _Predicted:
+    """Predictions (E, T, 3) beside measured motion (E, T, 3) at 100 Hz, the first three frames being the warm-up."""
+    count, frames, _ = measured.shape
+    body = replace(ball_body(0.04), centers=batch([[0.0, 0.0, 0.03]]))
+    seen = torch.ones(count, frames, 1, dtype=torch.float64)
+    times = (torch.arange(frames, dtype=torch.float64) / 100).expand(count, -1)
+    after = (seen > 0) & (torch.arange(frames)[None, :, None] > 2)
+    measured_at: Any = SimpleNamespace(position_m=measured[:, :, None], times_s=times, seen=seen, free=(0,))
+    return _Predicted(
+        world=replace(world_with("ball"), bodies=(body,)),
+        seen=measured_at,
+        after=after,
+        last=torch.full((count,), 2),
+        model=model[:, :, None],
+        free=(model if free is None else free)[:, :, None],
+    )
+
+
+def moving(count: int, frames: int = 43) -> torch.Tensor:
+    """Straight motion at 1 m/s along x, each episode at another place, in free flight for all that heights show."""
+    times = torch.arange(frames, dtype=torch.float64) / 100
+    falls = torch.stack([times, 0 * times, 3 * times - 4.905 * times**2], -1)
+    return falls + torch.arange(count, dtype=torch.float64)[:, None, None] * torch.tensor([0.0, 5.0, 0.0])
+
+
+def test_errors_count_after_the_warm_up_and_bodies_that_stay_or_go_on_start_there() -> None:
+    measured = moving(2)
+    off = measured.clone()
+    off[0, :3] += 7.0  # in the warm-up
+    off[0, 3:, 0] += 0.3
+    off[1, 23:, 1] -= 0.4  # in half of the frames after it
+    one = predicted(off, measured)
+    assert one.size_m == pytest.approx(SIZE_M)
+    assert one._errors(one.model).tolist() == pytest.approx([0.3, 0.2])
+    still, steady = one._held(False), one._held(True)
+    torch.testing.assert_close(still, measured[:, 2:3, None].expand_as(still))
+    along = (measured[:, 2] - measured[:, 0]) / 0.02
+    torch.testing.assert_close(steady[:, 12, 0], measured[:, 2] + 0.1 * along)
+    torch.testing.assert_close(steady[:, 0, 0], measured[:, 0])
+
+
+@pytest.mark.parametrize("steady", [False, True])
+def test_a_model_has_to_be_twice_as_good_as_no_model(steady: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(described_motion, "clearance", lambda *_: torch.zeros(4, 43, dtype=torch.float64))
+    times = torch.arange(43, dtype=torch.float64) / 100
+    # a curve that a body at rest, or one that keeps its velocity, misses by a known distance
+    away = 0.2 * (times > 0.025) if not steady else 5 * times - 0.2 * (times > 0.025)
+    measured = torch.stack([away, 0 * times, 0.5 + 0 * times], -1).expand(4, -1, -1)
+    least = LIMITS.times_worse * 0.2 + LIMITS.sizes_worse * SIZE_M
+    for error, found in ((0.99 * least, False), (1.01 * least, True)):
+        one = predicted(measured + torch.tensor([0.0, error, 0.0]), measured, measured)
+        verdict = one.verdict()
+        assert (verdict is not None) is found
+        if verdict is not None:
+            assert verdict.worse_than == ("steady" if steady else "still") and not verdict.never_touches
+            assert verdict.error_m == pytest.approx(error) and verdict.episodes == 4
+            assert (verdict.steady_error_m if steady else verdict.still_error_m) == pytest.approx(0.2)
+    some = measured + torch.tensor([0.0, 3 * least, 0.0]) * torch.tensor([1.0, 1.0, 0.0, 0.0])[:, None, None]
+    assert predicted(some, measured, measured).verdict() is None  # in half of the episodes
+    gone = predicted(torch.full_like(measured, torch.inf), measured, measured).verdict()
+    assert gone is not None and gone.error_m is None
+
+
+def test_contact_is_what_changes_the_prediction_and_what_tracks_show() -> None:
+    measured = moving(4)
+    model, free = measured.clone(), measured.clone()
+    free[0, 10, 2] -= 1.01 * LIMITS.touch_m
+    free[1, 10, 2] -= 0.99 * LIMITS.touch_m
+    free[2, 1, 2] -= 1.0  # before the warm-up ends
+    one = predicted(model, measured, free)
+    assert one._touches_in_model().tolist() == [True, False, False, False]
+    level = measured.clone()
+    level[1, :, 2] = 0.5
+    assert predicted(model, level)._touched_in_tracks().tolist() == [False, True, False, False]
+    hidden = predicted(model, level)
+    hidden.seen.seen[1, 5:] = 0
+    assert not bool(hidden._touched_in_tracks().any())
+    weightless = replace(hidden, world=replace(hidden.world, gravity=0 * hidden.world.gravity))
+    assert not bool(weightless._touched_in_tracks().any())
+
+
+def test_the_cause_follows_from_the_distance_to_what_could_be_touched(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = moving(3)
+    sunk = measured.clone()
+    sunk[:2, 10, 2] -= 1.01 * SIZE_M
+    one = predicted(sunk, measured)
+    assert one._sinks() and not predicted(measured + sunk - sunk, measured)._sinks()
+    sunk[:, 10, 2] = measured[:, 10, 2] - 0.99 * SIZE_M
+    assert not predicted(sunk, measured)._sinks()
+    near, inside = LIMITS.near_sizes * SIZE_M, -LIMITS.inside_sizes * SIZE_M
+    for gap, said in (
+        (torch.inf, "nothing to touch"),
+        (1.01 * near, "too low"),
+        (0.99 * near, "wrong shape"),
+        (0.99 * inside, "wrong shape"),
+        (1.01 * inside, "too high"),
+    ):
+        gaps = torch.full((3, 43), gap, dtype=torch.float64)
+        gaps[:, 7:] += 1.0  # the nearest frame counts
+        monkeypatch.setattr(described_motion, "clearance", lambda *_, gaps=gaps: gaps)
+        assert said in one._cause()
+
+
+def test_a_bounce_is_fast_and_a_support_lasts() -> None:
+    times = torch.arange(0, 0.6, 0.01, dtype=torch.float64)
+    for speed, found in ((1.05 * LIMITS.turn_m_s, True), (0.95 * LIMITS.turn_m_s, False)):
+        # falls ever more slowly before, rises ever faster after: level nowhere
+        bounce = speed * (times - 0.295).abs() + 20 * (times - 0.295).square()
+        bounce[28:33] = speed * (times[28:33] - 0.295).abs()
+        assert _supported(times, bounce, 9.81) is found
+    free_m = 0.5 * 9.81 * (LIMITS.level_s / 2) ** 2 * LIMITS.level_share
+    for change, found in ((0.97 * free_m, True), (1.1 * free_m, False)):
+        assert _supported(times, change / LIMITS.level_s * times, 9.81) is found
+    short = times[times < 0.95 * LIMITS.level_s]
+    assert not _supported(short, 0 * short, 9.81)
