@@ -12,7 +12,9 @@ from .case import Case
 from .registry import EFFECTS, Size
 from .things import Kind
 
-Stage = Literal["development", "report", "report2", "report3", "report4", "report5", "report6", "report7", "report8"]
+Stage = Literal[
+    "development", "report", "report2", "report3", "report4", "report5", "report6", "report7", "report8", "report9"
+]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on the first stage alone. Results on a report stage were known when `diagnose` was changed
 afterwards, so that each of these changes has to be judged on a later stage:
@@ -25,9 +27,11 @@ afterwards, so that each of these changes has to be judged on a later stage:
 - `report6`: tilted frames were no longer refused, and torsional friction had to fit better than friction maps
   (2026-11-22);
 - `report7`: slight effects in flight needed more evidence, correlated errors were modelled, and effects in flight
-  became alternatives in captures without flight (2026-11-23).
+  became alternatives in captures without flight (2026-11-23);
+- `report8`: a value beyond the plausible size of its parameter counted against an effect, and segments of contact
+  alone needed a larger score (2026-11-26).
 
-The present version is judged on `report8`."""
+The present version is judged on `report9`."""
 Noise = Literal["spread", "study"]
 
 UNKNOWN = tuple(name for name, entry in EFFECTS.items() if entry.acts == "unknown")
