@@ -122,9 +122,12 @@ def quat_rotate(quat_wxyz: Tensor, vector: Tensor) -> Tensor:
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Return the cross product of vectors (..., 3); batch dimensions broadcast."""
+    """Return the cross product of vectors (..., 3), of the more exact type of both; batch dimensions broadcast."""
     if a.dim() != b.dim():
         a, b = torch.broadcast_tensors(a, b)
+    if a.dtype != b.dtype:
+        exact = torch.promote_types(a.dtype, b.dtype)
+        a, b = a.to(exact), b.to(exact)
     return torch.linalg.cross(a, b)
 
 

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from cgwm.pipeline.geometry.rotation import (
+    cross,
     geodesic_angle,
     matrix_to_quat,
     quat_conjugate,
@@ -66,3 +67,13 @@ def test_matrix_round_trip_also_at_half_turns(quats: torch.Tensor) -> None:
 def test_derivatives_are_finite_and_right_also_at_zero(scale: float) -> None:
     vector = scale * torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda v: quat_log(quat_exp(v)), vector.requires_grad_(), eps=1e-7, atol=1e-5)
+
+
+def test_cross_products_broadcast_and_take_the_more_exact_type() -> None:
+    a, b = torch.randn(4, 1, 3, dtype=torch.float64), torch.randn(5, 3, dtype=torch.float64)
+    found = cross(a, b)
+    assert found.shape == (4, 5, 3)
+    for i in range(4):
+        for j in range(5):
+            torch.testing.assert_close(found[i, j], torch.linalg.cross(a[i, 0], b[j]))
+    assert cross(a, b.float()).dtype == cross(a.float(), b).dtype == torch.float64

@@ -16,7 +16,7 @@ from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import ContactParameters, SynthesizeConfig, UsageError
 from pipeline.sg_gs.test_sg_gs import CONFIG, PLACE, RADIUS, make_capture, write_manifest
 
-BRIEF = {"iterations": 4, "max_scene_spheres": 100, "bare_ground": False}
+BRIEF = {"iterations": 4, "max_scene_spheres": 100, "bare_ground": False, "flat_faces": False, "image_size": 64}
 VISUAL = CONFIG.model_copy(update={"collision": "visual", **BRIEF})
 
 
