@@ -42,8 +42,14 @@ which costs a fifth of the time. The headers of C++14 are read in a third of the
 BUILD_S = 120.0
 """Time limit of the compiler [s]."""
 NO_COMPILER = "there is no C++ compiler (g++, clang++ or c++)"
-THREAD_ROLLOUTS = 16
-"""Minimum number of rollouts per thread."""
+THREAD_CONTACT_STEPS = 20_000
+"""Minimum number of steps times possible contacts per thread: about a millisecond, many times what a thread costs."""
+SUBSTEPS = 10
+"""Place of `Packed.substeps` among the tensors of a launch."""
+SHARES = 4
+"""Number of times that a thread comes for rollouts, so that all end at about the same time."""
+MOST_AT_ONCE = 8
+"""Maximum number of rollouts that a thread takes at once."""
 
 
 def lacking(world: World) -> str | None:
@@ -74,8 +80,16 @@ def simulate_on_host(
 def launch_on_host(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
     """Run the kernel of a structure on the CPU; arguments as of `launch`, tensors on the CPU."""
     pointers = [ctypes.c_void_p(None if tensor is None else tensor.data_ptr()) for tensor in tensors]
-    threads = max(1, min(kernel_threads(), numbers[0] // THREAD_ROLLOUTS))
-    _library(structure).run(ctypes.c_int(threads), *pointers, *(ctypes.c_int(number) for number in numbers))
+    substeps = tensors[SUBSTEPS]
+    steps = 1 if substeps is None else max(1, int(substeps.sum()))
+    threads = threads_for(numbers[0], steps * max(1, structure.contacts))
+    share = max(1, min(MOST_AT_ONCE, numbers[0] // (SHARES * threads)))
+    _library(structure).run(*map(ctypes.c_int, (threads, share)), *pointers, *map(ctypes.c_int, numbers))
+
+
+def threads_for(rollouts: int, contact_steps: int) -> int:
+    """Return the number of threads for rollouts, of which each has a number of steps times possible contacts."""
+    return max(1, min(kernel_threads(), rollouts, rollouts * contact_steps // THREAD_CONTACT_STEPS))
 
 
 @cache

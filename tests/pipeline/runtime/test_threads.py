@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from cgwm.pipeline.physics.fused.host import THREAD_CONTACT_STEPS, threads_for
 from cgwm.pipeline.runtime.resources import kernel_threads, one_torch_thread
 
 
@@ -45,3 +46,16 @@ def test_threads_come_back_after_an_error_and_a_function_may_be_called_twice() -
         with pytest.raises(ValueError):
             fails()
         assert threads() == (3, 3)
+
+
+@pytest.mark.parametrize(
+    ("rollouts", "contact_steps", "expected"),
+    [
+        pytest.param(2, 100 * THREAD_CONTACT_STEPS, 2, id="a long rollout deserves a thread"),
+        pytest.param(64, 100 * THREAD_CONTACT_STEPS, 3, id="all threads"),
+        pytest.param(64, THREAD_CONTACT_STEPS // 32, 2, id="short ones share threads"),
+        pytest.param(5, 1, 1, id="one at least"),
+    ],
+)
+def test_a_kernel_takes_the_threads_that_its_work_is_worth(rollouts: int, contact_steps: int, expected: int) -> None:
+    assert threads_for(rollouts, contact_steps) == expected

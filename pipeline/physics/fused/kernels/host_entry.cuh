@@ -1,9 +1,9 @@
-struct Queue { const Problem* problem; int environments, next; };
+struct Queue { const Problem* problem; int environments, share, next; };
 
 static void* work(void* shared) {
     Queue& queue = *static_cast<Queue*>(shared);
-    for (int first; (first = __atomic_fetch_add(&queue.next, 8, __ATOMIC_RELAXED)) < queue.environments;) {
-        for (int index = first; index < first + 8 && index < queue.environments; index++) {
+    for (int first; (first = __atomic_fetch_add(&queue.next, queue.share, __ATOMIC_RELAXED)) < queue.environments;) {
+        for (int index = first; index < first + queue.share && index < queue.environments; index++) {
             Lanes lanes = {0, false};
             roll(*queue.problem, index, lanes);
         }
@@ -11,9 +11,9 @@ static void* work(void* shared) {
     return nullptr;
 }
 
-extern "C" void run(int threads, PARAMETERS) {
+extern "C" void run(int threads, int share, PARAMETERS) {
     const Problem problem = PROBLEM;
-    Queue queue = {&problem, environments, 0};
+    Queue queue = {&problem, environments, share, 0};
     pthread_t* others = new pthread_t[threads];
     int count = 0;  // where the system gives no more threads, those that there are do the work
     while (count + 1 < threads && pthread_create(&others[count], nullptr, work, &queue) == 0) count++;
