@@ -107,7 +107,7 @@ class ClosedLoop:
         world = self._world
         self._sent = DeviceState(world, device) if self._cuda and not world.gravity.is_cuda else None
         self._picture = _NoFrames(device) if camera is None else FrameRenderer(model, camera, device)
-        self._servos = [chain for chain in world.chains if JointCommand.needed(chain)]
+        self._servos = [chain for chain in world.chains if chain.has_servos]
         self._targets: dict[str, Tensor] = {}
         self._poses: dict[str, tuple[Tensor, Tensor]] | None = None
         self._steps = 0
@@ -134,7 +134,7 @@ class ClosedLoop:
             shape = tuple(getattr(state, name).shape)
             if shape != (1, count, size):
                 raise InputDataError(f"the start's {name} has the shape {shape}.", f"{(1, count, size)}.")
-        start = State(*(value.detach().to(world.gravity) for value in vars(state).values()))
+        start = State(*(value.detach().to(world.gravity) for value in state.tensors))
         start = replace(start, quat_wxyz=quat_normalize(start.quat_wxyz))
         pose = (start.position_m.to("cpu", torch.float64), start.quat_wxyz.to("cpu", torch.float64))
         driven = [k for k, body in enumerate(world.bodies) if body.motion == "driven"]

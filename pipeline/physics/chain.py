@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -134,6 +134,20 @@ class JointFrames:
     """Whether each is a hinge, shape (joints,)."""
 
 
+@dataclass(frozen=True)
+class Generation:
+    """Links of a chain with equally many ancestors, as indices."""
+
+    links: Tensor
+    """Their places in `Chain.links`."""
+    joints: Tensor
+    """Places of their joints in `Chain.joints`."""
+    parents: Tensor
+    """Places of their parents in `Chain.links`."""
+    above: Tensor
+    """Places of their parents among all links one generation after the other, the root first."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Chain:
     """Links joined in a tree."""
@@ -198,6 +212,16 @@ class Chain:
             turns=torch.tensor([kind == "hinge" for kind in kinds], device=device),
         )
 
+    @cached_property
+    def moving_places(self) -> list[int]:
+        """Place in `joints` of each joint of `moving`."""
+        return [k for k, joint in enumerate(self.joints) if joint.kind != "fixed"]
+
+    @cached_property
+    def has_servos(self) -> bool:
+        """Whether a joint has a servo."""
+        return bool(self.moving) and bool((self.numbers("stiffness") > 0).any())
+
     def moves(self, link: str) -> bool:
         """Return whether a joint, or the free root, moves a link."""
         return self.base == "free" or any(self.above[self.links.index(link)])
@@ -207,18 +231,36 @@ class Chain:
         return _side_by_side([getattr(joint, name) for joint in self.moving])
 
     @cached_property
-    def generations(self) -> tuple[tuple[list[int], list[int]], ...]:
-        """Places in `links` of links with equally many ancestors, and of their parents; children of the root first."""
+    def generations(self) -> tuple[Generation, ...]:
+        """Links with equally many ancestors, children of the root first."""
         depth = [0]
         for parent in self.parents[1:]:
             depth.append(depth[parent] + 1)
         rows = [[k for k, ancestors in enumerate(depth) if ancestors == d] for d in range(1, max(depth) + 1)]
-        return tuple((row, [self.parents[k] for k in row]) for row in rows)
+        places = {0: 0}
+        for row in rows:
+            places |= {link: len(places) + number for number, link in enumerate(row)}
+        parents = [[self.parents[k] for k in row] for row in rows]
+        index = partial(torch.tensor, device=self.joints[0].axis.device)
+        return tuple(
+            Generation(index(row), index([k - 1 for k in row]), index(above), index([places[k] for k in above]))
+            for row, above in zip(rows, parents, strict=True)
+        )
+
+    @cached_property
+    def generation_order(self) -> Tensor:
+        """Place of each link among all links one generation after the other, the root first."""
+        return torch.cat([torch.zeros_like(self.in_joints[:1]), *(row.links for row in self.generations)]).argsort()
+
+    @cached_property
+    def in_joints(self) -> Tensor:
+        """Place of the joint of each link but the root in `moving`, or behind its last, shape (L - 1,)."""
+        places = [column if column >= 0 else len(self.moving) for column in self.columns[1:]]
+        return torch.tensor(places, device=self.joints[0].axis.device)
 
     def in_links(self, values: Tensor) -> Tensor:
         """Return numbers (B, joints) of the moving joints by joint, (B, all joints), 0 for fixed ones."""
-        padded = torch.nn.functional.pad(values, (0, 1))
-        return padded[:, [column if column >= 0 else values.shape[1] for column in self.columns[1:]]]
+        return torch.nn.functional.pad(values, (0, 1)).index_select(1, self.in_joints)
 
     def poses(self, position: Tensor, quat: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return the poses of all links: positions (B, L, 3) [m] and quaternions (B, L, 4).
@@ -234,16 +276,12 @@ class Chain:
         offset = frames.position + quat_rotate(frames.quat_wxyz, moved)
         turn = quat_multiply(frames.quat_wxyz, quat_exp(turned))
         batch = max(position.shape[0], quat.shape[0], offset.shape[0], turn.shape[0])
-        positions = [position.expand(batch, 3)] * len(self.links)
-        quats = [quat.expand(batch, 4)] * len(self.links)
-        for rows, parents in self.generations:
-            above = torch.stack([quats[k] for k in parents], 1)
-            own = [k - 1 for k in rows]
-            place = torch.stack([positions[k] for k in parents], 1) + quat_rotate(above, offset[:, own])
-            orientation = quat_multiply(above, turn[:, own])
-            for number, row in enumerate(rows):
-                positions[row], quats[row] = place[:, number], orientation[:, number]
-        return torch.stack(positions, 1), torch.stack(quats, 1)
+        places, turns = position.expand(batch, 3)[:, None], quat.expand(batch, 4)[:, None]
+        for row in self.generations:
+            origin, carrier = places.index_select(1, row.above), turns.index_select(1, row.above)
+            places = torch.cat((places, origin + quat_rotate(carrier, offset.index_select(1, row.joints))), 1)
+            turns = torch.cat((turns, quat_multiply(carrier, turn.index_select(1, row.joints))), 1)
+        return places.index_select(1, self.generation_order), turns.index_select(1, self.generation_order)
 
 
 def _side_by_side(values: Sequence[Tensor]) -> Tensor:
@@ -294,14 +332,12 @@ def link_velocities(
     zero = torch.zeros_like(along)
     sliding = torch.where(frames.slides[:, None], along, zero)
     turning = torch.where(frames.turns[:, None], along, zero)
-    linear = [root[0].expand_as(position[:, 0])] * len(chain.links)
-    omega = [root[1].expand_as(position[:, 0])] * len(chain.links)
-    for rows, parents in chain.generations:
-        own = [k - 1 for k in rows]
-        above = torch.stack([omega[k] for k in parents], 1)
-        carried = torch.stack([linear[k] for k in parents], 1)
-        carried = carried + cross(above, position[:, rows] - position[:, parents]) + sliding[:, own]
-        spin = above + turning[:, own]
-        for number, row in enumerate(rows):
-            linear[row], omega[row] = carried[:, number], spin[:, number]
-    return torch.stack(linear, 1), torch.stack(omega, 1)
+    order = chain.generation_order
+    linear, omega = (part.expand_as(position[:, 0])[:, None] for part in root)
+    for row in chain.generations:
+        carrier, own = omega.index_select(1, row.above), row.joints
+        away = position.index_select(1, row.links) - position.index_select(1, row.parents)
+        moved = linear.index_select(1, row.above) + cross(carrier, away) + sliding.index_select(1, own)
+        linear = torch.cat((linear, moved), 1)
+        omega = torch.cat((omega, carrier + turning.index_select(1, own)), 1)
+    return linear.index_select(1, order), omega.index_select(1, order)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from ...schemas import InputDataError, UsageError
 from ..geometry.rotation import cross, quat_conjugate, quat_exp, quat_multiply, quat_rotate
+from ..optimization.forward_mode import parts_of
 from .chain import BASES, Chain, JointFrames, link_velocities
 from .world import Body, State, World
 
@@ -120,6 +123,9 @@ def joint_values(names: Sequence[str], state: State, chain: Chain, exact: bool =
     if not chain.moving:
         nothing = state.position_m.new_zeros(state.position_m.shape[0], 0)
         return nothing, nothing
+    made = _MADE.get(state.position_m)
+    if made is not None and made.chain is chain and made.of(state):
+        return made.value, made.speed
     rows = [names.index(name) for name in chain.links]
     child, parent = rows[1:], [rows[up] for up in chain.parents[1:]]
     position, quat, velocity, omega_body = (x[:, child] for x in state.tensors)
@@ -135,8 +141,7 @@ def joint_values(names: Sequence[str], state: State, chain: Chain, exact: bool =
     turning = (axis * (quat_rotate(quat, omega_body) - omega)).sum(-1)
     sliding = (axis * (velocity - carrier - cross(omega, away))).sum(-1)
     speed = torch.where(joints.slides, sliding, turning)
-    moving = [k for k, joint in enumerate(chain.joints) if joint.kind != "fixed"]
-    return value[:, moving], speed[:, moving]
+    return value[:, chain.moving_places], speed[:, chain.moving_places]
 
 
 def _values(joints: JointFrames, offset: Tensor, turned: Tensor) -> Tensor:
@@ -198,10 +203,14 @@ def with_joints(
 def _posed(
     world: World, state: State, chain: Chain, values: Mapping[str, float | Tensor], speeds: Mapping[str, float | Tensor]
 ) -> State:
-    rows = [world.body_names.index(name) for name in chain.links]
+    names = world.body_names
+    rows = [names.index(name) for name in chain.links]
     like = state.position_m
     columns = []
     for given in (values, speeds):
+        if chain.joint_names and not any(isinstance(number, Tensor) for number in given.values()):
+            columns.append(like.new_tensor([given.get(name, 0.0) for name in chain.joint_names]).expand(len(like), -1))
+            continue
         parts = [torch.as_tensor(given.get(name, 0.0)).to(like).reshape(-1) for name in chain.joint_names]
         batch = max([like.shape[0], *(len(part) for part in parts)])
         columns.append(torch.stack([part.expand(batch) for part in parts], -1) if parts else like.new_zeros(batch, 0))
@@ -213,4 +222,35 @@ def _posed(
     fields = [x.expand(position.shape[0], -1, -1).clone() for x in state.tensors]
     for field, values_ in zip(fields, (position, quat, linear, quat_rotate(quat_conjugate(quat), omega)), strict=True):
         field[:, rows] = values_
-    return type(state)(*fields)
+    found = type(state)(*fields)
+    if chain.moving and _principal(chain, value):
+        _MADE[found.position_m] = _Made(chain, [(id(part), part._version) for part in found.tensors], value, speed)
+    return found
+
+
+@dataclass(frozen=True)
+class _Made:
+    """Joints from which a state was made, so that they need not be found again from the poses of the links."""
+
+    chain: Chain
+    """Their chain."""
+    tensors: list[tuple[int, int]]
+    """Number and version of the state's tensors then: one that was changed in place is another state."""
+    value: Tensor
+    """Values of the moving joints (B, joints)."""
+    speed: Tensor
+    """Their speeds."""
+
+    def of(self, state: State) -> bool:
+        """Return whether a state is the one that was made."""
+        return self.tensors == [(id(part), part._version) for part in state.tensors]
+
+
+_MADE: MutableMapping[Tensor, _Made] = WeakTensorKeyDictionary()
+
+
+@torch.no_grad()
+def _principal(chain: Chain, value: Tensor) -> bool:
+    """Return whether values (B, joints) are those which `joint_values` would find, not whole turns away."""
+    turned = (parts_of(value)[0].detach() - chain.frames.middle[:, chain.moving_places]).abs() < math.pi
+    return bool((turned | chain.frames.slides[chain.moving_places]).all())

@@ -128,6 +128,8 @@ def lacking_derivatives(
     record_contacts: bool,
 ) -> str | None:
     """Return the requested derivatives that the kernel does not support, in words; None for none."""
+    if not torch.is_grad_enabled() and not record_contacts:
+        return None
     tensors = list(_tensors(world, state, times_s, driven))
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return "derivatives in reverse are asked for"

@@ -100,11 +100,6 @@ class JointCommand:
         return value
 
     @staticmethod
-    def needed(chain: Chain) -> bool:
-        """Return whether a joint of a chain has a servo."""
-        return bool(chain.moving) and bool((chain.numbers("stiffness") > 0).any())
-
-    @staticmethod
     def of(chain: Chain, driven: Mapping[str, object], like: Tensor) -> JointCommand | None:
         """Return the command of a chain; None where no joint of it has a servo.
 
@@ -112,7 +107,7 @@ class JointCommand:
             InputDataError: If its servos have no command, or one for another number of joints.
         """
         count = len(chain.moving)
-        if not JointCommand.needed(chain):
+        if not chain.has_servos:
             return None
         command = driven.get(chain.name)
         if not isinstance(command, JointCommand):

@@ -138,6 +138,19 @@ class World:
             kept[make] = make(self)
         return cast(T, kept[make])
 
+    def latest(self, make: Callable[[World, State, Tensor], T], state: State, times_s: Tensor) -> T:
+        """Return `make(self, state, times_s)`, kept with the world until it is asked for with other objects.
+
+        For callers that simulate one start under several commands. Tensors that were changed in place are others.
+        """
+        kept: dict[object, object] = self.__dict__.setdefault("_kept", {})
+        versions = [tensor._version for tensor in (*state.tensors, times_s)]
+        found = cast("tuple[State, Tensor, list[int], T] | None", kept.get((World.latest, make)))
+        if found is None or found[0] is not state or found[1] is not times_s or found[2] != versions:
+            found = state, times_s, versions, make(self, state, times_s)
+            kept[World.latest, make] = found
+        return found[3]
+
     @property
     def body_names(self) -> list[str]:
         """Names of the bodies, in the order of the state."""
@@ -356,7 +369,7 @@ class State:
     @property
     def tensors(self) -> tuple[Tensor, ...]:
         """The fields in their order, from which `State(*tensors)` is made again."""
-        return tuple(vars(self).values())
+        return tuple(getattr(self, field.name) for field in fields(self))
 
     def at(self, rows: Tensor | Sequence[int] | slice) -> State:
         """Return the state at some rows of the batch."""

@@ -275,7 +275,7 @@ def line_state(segments: Segments, frames: int) -> State:
     """Return states at the first frames from straight lines through some frames; in flight with gravity."""
     seen, world = segments.observations, segments.world
     state = seen.state
-    fields = [value.clone() for value in vars(state).values()]
+    fields = [value.clone() for value in state.tensors]
     t = (seen.times_s - seen.times_s[:, :1])[:, :frames]
     fall = 0.5 * t.square()[..., None] * world.gravity[:, None] if segments.kind == "flight" else torch.zeros(1)
     for column, body in enumerate(seen.free):

@@ -66,7 +66,7 @@ def grounded_states(segments: Segments, state: State) -> State:
     """Return states with the body on the ground in its mean orientation, without speed along the normal."""
     seen, world = segments.observations, segments.world
     (normal, offset), index = GroundPlane.of(world), seen.free[0]
-    fields = [value.clone() for value in vars(state).values()]
+    fields = [value.clone() for value in state.tensors]
     weight = seen.has_orientation[:, :, 0, None]
     up = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ normal
     up = torch.nn.functional.normalize((up * weight).sum(1), dim=-1)

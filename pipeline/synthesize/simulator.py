@@ -137,7 +137,7 @@ class Simulator:
 
     def _held(self, state: State) -> dict[str, JointCommand]:
         """Return the commands of servos, which hold the values that their joints have at the start."""
-        chains = [chain for chain in self._world.chains if JointCommand.needed(chain)]
+        chains = [chain for chain in self._world.chains if chain.has_servos]
         held = {chain.name: joints_of(self._world, state, chain)[0].to(self._device) for chain in chains}
         return {name: JointCommand.hold_still(values) for name, values in held.items()}
 

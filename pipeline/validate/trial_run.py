@@ -137,7 +137,7 @@ def _simulated(world: World, state: State) -> Rollout:
     fused = lacking(world) is None
     steps = max((MOST_SWEEPS if fused else MOST_SWEEPS_TORCH) // world.iterations, FRAMES)
     times = torch.linspace(0.0, min(LENGTH_S, steps * world.step_s), FRAMES, dtype=torch.float64)
-    chains = [chain for chain in world.chains if JointCommand.needed(chain)]
+    chains = [chain for chain in world.chains if chain.has_servos]
     held = {chain.name: JointCommand.hold_still(joints_of(world, state, chain)[0]) for chain in chains}
     return (rollout if fused else simulate)(world, state, times, held)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import torch
@@ -99,21 +100,15 @@ def pack(
         InputDataError: If a driven body has no track.
     """
     fixed = world.once(_fixed)
-    turn, effects = fixed.turn, fixed.effects
+    turn = fixed.turn
     times = times_s if times_s.ndim == 2 else times_s[None]
     commands = Commands.of(world, driven, state.position_m.detach(), turn)
-    columns = _columns(world, state, turn, fixed.structure.turned, effects)
-    counts = torch.tensor(world.substeps(times), dtype=torch.int32, device=times.device)
-    steps = _steps(wrenches.closed_forms(world), times, counts)
-    batch = max(len(x) for x in (*columns, fixed.geometry, fixed.surfaces, steps, *commands.tensors))
+    alone = len(state.position_m) == 1 and not torch.is_inference(state.position_m)
+    table, steps, counts = world.latest(_begun, state, times_s) if alone else _begun(world, state, times_s)
+    batch = max(len(x) for x in (table, fixed.geometry, fixed.surfaces, steps, *commands.tensors))
     return Packed(
-        structure=replace(
-            fixed.structure,
-            record=record,
-            drives=tuple(commands.bodies.index(k) if k in commands.bodies else -1 for k in range(len(world.bodies))),
-            tree=tree.tree_of(world, len(commands.bodies), commands.chains) if world.chains else None,
-        ),
-        table=torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1),
+        structure=world.once(_Layout(record, tuple(commands.bodies), tuple(commands.chains))),
+        table=table.expand(batch, -1),
         steps=steps,
         geometry=fixed.geometry,
         surfaces=fixed.surfaces,
@@ -126,6 +121,37 @@ def pack(
         drive_last=commands.last(counts),
         turn=turn,
     )
+
+
+def _begun(world: World, state: State, times_s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return `Packed.table` (1 or B, columns), `Packed.steps` and `Packed.substeps`: what no command changes."""
+    fixed = world.once(_fixed)
+    times = times_s if times_s.ndim == 2 else times_s[None]
+    columns = _columns(world, state, fixed.turn, fixed.structure.turned, fixed.effects)
+    counts = torch.tensor(world.substeps(times), dtype=torch.int32, device=times.device)
+    batch = max(map(len, columns))
+    table = torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1)
+    return table, _steps(world.once(wrenches.closed_forms), times, counts), counts
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Returns the constants of the kernel for a world and its commands."""
+
+    record: bool
+    """Whether contacts are recorded."""
+    bodies: tuple[int, ...]
+    """Bodies with a command."""
+    chains: tuple[int, ...]
+    """Chains with a command."""
+
+    def __call__(self, world: World) -> Structure:
+        return replace(
+            world.once(_fixed).structure,
+            record=self.record,
+            drives=tuple(self.bodies.index(k) if k in self.bodies else -1 for k in range(len(world.bodies))),
+            tree=tree.tree_of(world, len(self.bodies), self.chains) if world.chains else None,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,9 +264,14 @@ def _steps(laws: Sequence[ContactLaw], times: Tensor, substeps: Tensor) -> Tenso
         further = zero.expand(times.shape[0], 2 * len(laws) - 2)
         return torch.cat((zero.expand(times.shape[0], 3), times, further), -1)[:, None]
     h = times.diff(dim=1) / substeps
-    each = [coefficients(law.contact_time_s[:, None], law.damping_ratio[:, None], h) for law in laws]
-    further = [value for pair in each[1:] for value in pair]
-    return torch.stack(torch.broadcast_tensors(h, *each[0], times[:, :-1], *further), -1)
+    time, ratio = (
+        torch.stack(torch.broadcast_tensors(*(getattr(law, name) for law in laws)), -1)[:, None]
+        for name in ("contact_time_s", "damping_ratio")
+    )
+    each = torch.stack(coefficients(time, ratio, h[..., None]), -1)
+    parts = (h[..., None], each[..., 0, :], times[:, :-1, None], each[..., 1:, :].flatten(-2))
+    batch = max(map(len, parts))
+    return torch.cat([part.expand(batch, -1, -1) for part in parts], -1)
 
 
 def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effects: list[Tensor]) -> list[Tensor]:
@@ -248,27 +279,39 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
     zero = torch.zeros_like(world.gravity[:, :1])
     offset = zero if world.ground_offset is None else world.ground_offset[:, None]
     columns = [in_frame(turn, world.gravity), offset]
-    columns += [law.friction[:, None] for law in wrenches.closed_forms(world)]
+    columns += [law.friction[:, None] for law in world.once(wrenches.closed_forms)]
     if turned and turn is not None:
         columns.append(turn[None])
     columns += [in_frame(turn, effect) if effect.shape[-1] == 3 else effect for effect in effects]
     columns += tree.columns(world, state)
-    for index, body in enumerate(world.bodies):
-        position, quat, velocity = (x[:, index] for x in (state.position_m, state.quat_wxyz, state.velocity_m_s))
-        still = torch.zeros_like(position)
-        if body.free:
-            motion = start(body, position, quat, velocity, state.omega_body_rad_s[:, index])
-            position, quat, velocity, spin = motion.com, motion.quat_wxyz, motion.velocity, motion.spin
-            inverse = torch.linalg.inv(body.inertia).flatten(1)
-            inertia = torch.cat([inverse[:, k : k + 1] for k in (0, 4, 8, 1, 2, 5)], -1)
-            columns += [body.mass.reciprocal()[:, None], inertia, body.com]
+    others = None if all(body.free for body in world.bodies) else _other_columns(world, state, turn)
+    for free, group in groupby(range(len(world.bodies)), lambda index: world.bodies[index].free):
+        rows = [*group]
+        if free or others is None:
+            columns += [x for index in rows for x in _free_columns(world.bodies[index], index, state, turn)]
         else:
-            velocity, spin = still, still
-            if body.motion == "link":
-                velocity, spin = tree.link_motion(world, index, state)
-            columns += [zero, zero.expand(-1, 6), zero.expand(-1, 3)]
-        columns += [in_frame(turn, position), quat_in_frame(turn, quat), in_frame(turn, velocity), in_frame(turn, spin)]
+            columns.append(others[:, rows[0] : rows[-1] + 1].flatten(1))
     return columns
+
+
+def _free_columns(body: Body, index: int, state: State, turn: Tensor | None) -> list[Tensor]:
+    """Return the columns of a free body: inverse mass and inertia, centre of mass, motion."""
+    motion = start(body, *(part[:, index] for part in state.tensors))
+    inverse = torch.linalg.inv(body.inertia).flatten(1)
+    inertia = torch.cat([inverse[:, k : k + 1] for k in (0, 4, 8, 1, 2, 5)], -1)
+    moving = (in_frame(turn, x) for x in (motion.velocity, motion.spin))
+    pose = in_frame(turn, motion.com), quat_in_frame(turn, motion.quat_wxyz)
+    return [body.mass.reciprocal()[:, None], inertia, body.com, *pose, *moving]
+
+
+def _other_columns(world: World, state: State, turn: Tensor | None) -> Tensor:
+    """Return the columns (B, bodies, columns) that each body has if it is not free: no mass, and its pose."""
+    position, quat = in_frame(turn, state.position_m), quat_in_frame(turn, state.quat_wxyz)
+    massless, still = position.new_zeros(*position.shape[:2], 10), position.new_zeros(*position.shape[:2], 6)
+    for index in tree.free_roots(world):
+        motion = (in_frame(turn, x) for x in tree.root_motion(index, state))
+        still = torch.cat((still[:, :index], torch.cat((*motion,), -1)[:, None], still[:, index + 1 :]), 1)
+    return torch.cat((massless, position, quat, still), -1)
 
 
 def _spheres(body: Body) -> Tensor:

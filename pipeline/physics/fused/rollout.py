@@ -89,7 +89,7 @@ def roll(
     lanes: int | None = None,
 ) -> Rollout:
     """Check and pack the arguments of `simulate_fused`, run the kernel by `run`, and return the rollout."""
-    require_one_kind(world.gravity, *vars(state).values(), times_s)
+    require_one_kind(world.gravity, *state.tensors, times_s)
     world.once(require_physical)
     require_state(state, world.body_names)
     world = changed_by_effects(world)

@@ -56,7 +56,7 @@ class FusedStepper:
     def reset(self, state: State, drives: Mapping[str, Drive | JointCommand]) -> None:
         """See :class:`Stepper`; the state has the device and type of the world, the drives are on the CPU."""
         like = self._world.gravity
-        require_one_kind(like, *vars(state).values())
+        require_one_kind(like, *state.tensors)
         require_state(state, self._world.body_names)
         there = {name: _moved(drive, like.device) for name, drive in drives.items()}
         packed = pack(self._world, state, self._times, there, False)

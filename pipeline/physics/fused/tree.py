@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...geometry.rotation import quat_rotate
+from ...optimization.forward_mode import parts_of
 from ..chain import Chain
 from ..chain_state import joints_of
 from ..joint_command import JointCommand
@@ -51,6 +52,8 @@ class Tree:
     """Number of moving joints of each chain."""
     commands: tuple[int, ...] = ()
     """Number of the command of each chain's joints among all commands, -1 for none."""
+    light: tuple[int, ...] = ()
+    """1 for links without mass that are fixed to another one and carry only such links, else 0."""
     heavy: bool = False
     """Whether any link that moves has a mass."""
 
@@ -88,6 +91,7 @@ class Tree:
             "link_body": self.bodies, "link_parent": self.parents, "link_kind": self.kinds, "link_dof": self.dofs,
             "link_joint": self.joints, "link_depth": [len(row) for row in self.above],
             "link_root": [self._root(link) for link in range(len(self.bodies))], "dof_link": self.dof_links,
+            "link_light": self.light,
             "dof_depth": [len(row) for row in self.dof_above], "joint_dof": self.joint_dofs, "chain_root": self.roots,
             "chain_joint": self.firsts, "chain_joints": self.counts, "chain_command": self.commands, **padded,
         }  # fmt: skip
@@ -105,13 +109,26 @@ def tree_of(world: World, drives: int, commanded: Sequence[int]) -> Tree:
         drives: Number of commands before those of the joints.
         commanded: Numbers of the chains whose joints have a command.
     """
-    rows: dict[str, list] = {name: [] for name in Tree.__dataclass_fields__ if name != "heavy"}
+    rows: dict[str, list] = {name: [] for name in Tree.__dataclass_fields__ if name not in ("light", "heavy")}
     for number, chain in enumerate(world.chains):
         _append(rows, world, chain)
         rows["commands"].append(drives + list(commanded).index(number) if number in commanded else -1)
-    moving = [body for body, above in zip(rows["bodies"], rows["above"], strict=True) if above]
-    heavy = any(bool((world.bodies[body].mass != 0).any()) for body in moving)
-    return Tree(**{name: tuple(values) for name, values in rows.items()}, heavy=heavy)
+    masses = [_matters(world.bodies[body].mass) for body in rows["bodies"]]
+    heavy = any(mass for mass, above in zip(masses, rows["above"], strict=True) if above)
+    light = [
+        int(kind == _KINDS["fixed"] and not mass and not _matters(world.bodies[body].inertia))
+        for kind, mass, body in zip(rows["kinds"], masses, rows["bodies"], strict=True)
+    ]
+    for link, parent in reversed([*enumerate(rows["parents"])]):
+        if parent >= 0:
+            light[parent] *= light[link]
+    return Tree(**{name: tuple(values) for name, values in rows.items()}, light=tuple(light), heavy=heavy)
+
+
+def _matters(value: Tensor) -> bool:
+    """Return whether a number is not 0, or has a derivative."""
+    primal, tangent = parts_of(value)
+    return tangent is not None or bool((primal != 0).any())
 
 
 def _append(rows: dict[str, list], world: World, chain: Chain) -> None:
@@ -120,13 +137,14 @@ def _append(rows: dict[str, list], world: World, chain: Chain) -> None:
     rows["roots"].append(offset)
     rows["firsts"].append(len(rows["joint_dofs"]))
     rows["counts"].append(len(chain.moving))
+    names = world.body_names
     for place, (name, parent) in enumerate(zip(chain.links, chain.parents, strict=True)):
         link, first = offset + place, len(rows["dof_links"])
         joint = None if parent < 0 else chain.joints[place - 1]
         kind = int(chain.base == "free") if joint is None else _KINDS[joint.kind]
         before = rows["above"][offset + parent] if parent >= 0 else ()
         own = 6 if kind == 1 else int(kind in (2, 3))
-        rows["bodies"].append(world.body_names.index(name))
+        rows["bodies"].append(names.index(name))
         rows["parents"].append(offset + parent if parent >= 0 else -1)
         rows["kinds"].append(kind)
         rows["dofs"].append(first if own else -1)
@@ -155,7 +173,8 @@ def _fixed_columns(world: World) -> list[tuple[Tensor, Tensor]]:
 
 
 def _link_columns(world: World, chain: Chain) -> Tensor:
-    bodies = [world.bodies[world.body_names.index(name)] for name in chain.links]
+    names = world.body_names
+    bodies = [world.bodies[names.index(name)] for name in chain.links]
     like = bodies[0].mass
     upright, still = like.new_tensor([[1.0, 0.0, 0.0, 0.0]]), like.new_zeros(1, 3)
     places = [(still, upright, still), *((joint.position, joint.quat_wxyz, joint.axis) for joint in chain.joints)]
@@ -175,14 +194,15 @@ def _joint_numbers(chain: Chain) -> Tensor:
     return torch.stack([column.expand(batch, -1) for column in columns], -1)
 
 
-def link_motion(world: World, index: int, state: State) -> tuple[Tensor, Tensor]:
-    """Return velocity and angular velocity (B, 3) of a link at the start, world frame, as its chain moves it."""
-    chain = world.chains[world.chain_of(index)]
-    still = torch.zeros_like(state.position_m[:, index])
-    if world.bodies[index].name == chain.root and chain.base == "free":
-        omega = quat_rotate(state.quat_wxyz[:, index], state.omega_body_rad_s[:, index])
-        return state.velocity_m_s[:, index], omega
-    return still, still
+def free_roots(world: World) -> list[int]:
+    """Return the indices of the links that move freely, at the root of a chain."""
+    return [world.body_names.index(chain.root) for chain in world.chains if chain.base == "free"]
+
+
+def root_motion(index: int, state: State) -> tuple[Tensor, Tensor]:
+    """Return velocity and angular velocity (B, 3) of a free root at the start, world frame."""
+    omega = quat_rotate(state.quat_wxyz[:, index], state.omega_body_rad_s[:, index])
+    return state.velocity_m_s[:, index], omega
 
 
 def command_rows(world: World, driven: Mapping[str, object], like: Tensor) -> dict[int, tuple[Tensor, Tensor]]:

@@ -2,7 +2,8 @@
 
 from dataclasses import replace
 
-from cgwm.pipeline.physics.world import World
+import torch
+from cgwm.pipeline.physics.world import State, World
 from helpers.small_model import small_model
 
 
@@ -16,3 +17,18 @@ def test_what_depends_on_the_world_alone_is_made_once_for_each_world() -> None:
     other = replace(world, step_s=0.5 * world.step_s)
     assert [world.once(step), other.once(step), world.once(step)] == [world.step_s, other.step_s, world.step_s]
     assert [x is world for x in asked] == [True, False]
+
+
+def test_what_depends_on_a_start_is_kept_until_the_start_is_another_one_or_is_changed_in_place() -> None:
+    world, times, asked = World.from_model(small_model()), torch.zeros(1), []
+    starts = [State(*(torch.zeros(1, 1, size) for size in (3, 4, 3, 3))) for _ in range(2)]
+
+    def height(given: World, state: State, times_s: torch.Tensor) -> float:
+        asked.append((given, state, times_s))
+        return float(state.position_m[0, 0, 2])
+
+    assert [world.latest(height, starts[0], times) for _ in range(2)] == [0, 0] and len(asked) == 1
+    starts[0].position_m[0, 0, 2] = 1.0
+    assert world.latest(height, starts[0], times) == 1 and len(asked) == 2
+    assert world.latest(height, starts[1], times) == 0 and len(asked) == 3
+    assert world.latest(height, starts[0], times) == 1 and len(asked) == 4

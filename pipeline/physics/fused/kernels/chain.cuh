@@ -1,7 +1,7 @@
 #if LINKS
 // Links of chains, joined in trees: numbers of each environment, in the order in which they are read from the table.
 // The lists of the structure: link_body, link_parent (-1: root), link_kind (0: root that is fixed or driven, 1: free
-// root, 2: hinge, 3: slide, 4: fixed joint), link_dof (first coordinate of its own, -1: none), link_depth (coordinates
+// root, 2: hinge, 3: slide, 4: fixed joint), link_light (1: without mass, fixed to another, carries only such), link_dof (first coordinate of its own, -1: none), link_depth (coordinates
 // that move it) and link_above (these, DEPTH a link); dof_link, dof_depth, dof_above (a coordinate and those above it);
 // joint_dof; chain_root (a link), chain_joint (its first), chain_joints, chain_command (-1: none).
 struct Joint {

@@ -64,6 +64,7 @@ INLINE void configure(const Chain& chain, const Vec* positions, const Quat* quat
         Spatial turning = {axis, cross(at.origins[l], axis)}, moving = {none(), axis};
         at.joints[l] = link_kind[l] == 2 ? turning : moving;
 #if HEAVY
+        if (link_light[l]) continue;
         at.coms[l] = at.origins[l] + R * j.com;
         at.inertias[l] = turned(R, j.inertia);
 #endif
@@ -84,6 +85,7 @@ INLINE void add_mass(const Chain& chain, const Configuration& at, Real* A) {
     Vec moment[LINKS];
     Sym inertia[LINKS];
     for (int l = 0; l < LINKS; l++) {
+        if (link_light[l]) continue;
         Vec c = at.coms[l];
         mass[l] = chain.joints[l].mass;
         moment[l] = mass[l] * c;
@@ -96,7 +98,7 @@ INLINE void add_mass(const Chain& chain, const Configuration& at, Real* A) {
     }
     for (int l = LINKS - 1; l >= 0; l--) {
         int parent = link_parent[l];
-        if (parent < 0) continue;
+        if (parent < 0 || link_light[l]) continue;
         mass[parent] += mass[l];
         moment[parent] = moment[parent] + moment[l];
         Sym &to = inertia[parent], from = inertia[l];
@@ -140,6 +142,7 @@ INLINE void bias_of(const Environment& env, const Configuration& at, const Vec* 
     for (int d = 0; d < DOFS; d++) bias[d] = Real(0);
     for (int l = 0; l < LINKS; l++) {
         int parent = link_parent[l], dof = link_dof[l];
+        if (link_light[l]) continue;
         if (parent < 0) {
             Vec v = root_linear[l], w = root_angular[l];
             if (link_kind[l] == 1) {
@@ -173,6 +176,7 @@ INLINE void bias_of(const Environment& env, const Configuration& at, const Vec* 
     }
     for (int l = LINKS - 1; l >= 0; l--) {
         int parent = link_parent[l], dof = link_dof[l];
+        if (link_light[l]) continue;
         if (dof >= 0 && link_kind[l] != 1) bias[dof] = along(at.joints[l], force[l]);
         if (link_kind[l] == 1) {
             Vec f = force[l].moving, n = force[l].turning;

@@ -904,8 +904,14 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
         for (int k = 0; k < 3 * JOINTS; k++) env.chain.impulses[k] = Real(0);
     }
     if (env.lanes.any(env.chain.active)) sweep = -1;
-    bool reached[LINKS];  // in any environment of the warp
-    for (int l = 0; l < LINKS; l++) reached[l] = env.lanes.any(env.chain.known[l]);
+    // links that are touched in any environment of the warp, and the bodies that are no links or such ones
+    int reached[LINKS], reached_count = 0, touched[BODIES], touched_count = 0;
+    for (int b = 0; b < BODIES; b++) {
+        int l = body_link(b);
+        if (l >= 0 && !env.lanes.any(env.chain.known[l])) continue;
+        if (l >= 0) reached[reached_count++] = l;
+        touched[touched_count++] = b;
+    }
 #endif
 #if PAIRED
     const int first_sweep = sweep;
@@ -914,8 +920,12 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
     for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) active[p] = env.lanes.any(ends[p] > first);
 #endif
     do {
+#if LINKS
+        for (int i = 0; i < touched_count; i++) linear[touched[i]] = angular[touched[i]] = none();
+#else
         EACH_BODY
         for (int b = 0; b < BODIES; b++) linear[b] = angular[b] = none();
+#endif
 #if PAIRED
         if (loaded > 1 && sweep != first_sweep) {
             for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) {
@@ -950,15 +960,14 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #endif
 #if LINKS
         push_joints(env.chain);
-        for (int l = 0; l < LINKS; l++) {
-            int b = link_body[l];
-            if (!reached[l]) continue;
+        for (int i = 0; i < reached_count; i++) {
+            int l = reached[i], b = link_body[l];
             Vec impulse = env.lanes.sum(linear[b]), moment = env.lanes.sum(angular[b]);
             if (env.chain.known[l]) push_link(env.chain, l, impulse, moment);
         }
         if (sweep >= 0 && env.chain.active) sweep_joints(env.chain, env.laws[0].step_s);
-        for (int l = 0; l < LINKS; l++) {
-            int b = link_body[l];
+        for (int i = 0; i < reached_count; i++) {
+            int l = reached[i], b = link_body[l];
             if (!env.chain.known[l]) continue;
             motions[b].velocity = free_velocities[b];
             motions[b].omega = free_omegas[b];

@@ -51,12 +51,14 @@ def fused(request: pytest.FixtureRequest) -> Fused:
 def hand(base: str) -> Case:
     """Return two fingers of two joints on a palm that squeeze a ball of many spheres, on the ground or carried.
 
-    One joint has dry friction and one a limit that it reaches; one finger ends in a slide, and a tip is welded on.
+    One joint has dry friction and one a limit that it reaches; one finger ends in a slide, and a tip and a further part
+    without mass are welded on.
     """
     spheres = ((0.05, 0.0, 0.0, 0.012), (0.08, 0.0, 0.0, 0.012))
-    names = ("left", "left_tip", "right", "right_tip", "nail")
+    names = ("left", "left_tip", "right", "right_tip", "nail", "part")
     bodies: list[Body] = [link("palm", 0.4 if base == "free" else 0.0, spheres=((0.0, 0.0, -0.02, 0.02),))]
-    bodies += [link(name, 0.02, com=(0.04, 0, 0), spheres=spheres if name != "nail" else spheres[:1]) for name in names]
+    bodies += [link(name, 0.02, com=(0.04, 0, 0), spheres=spheres) for name in names[:4]]
+    bodies += [link("nail", 0.02, com=(0.04, 0, 0), spheres=spheres[:1]), link("part", 0.0, spheres=spheres[1:])]
     same: dict[str, Any] = {"damping": 0.02, "armature": 1e-3, "torque_limit": 0.4}
     joints = (
         Joint.of("l1", "hinge", "left", "palm", position_m=(0, 0.05, 0), stiffness=2.0, friction=0.01, **same),
@@ -64,6 +66,7 @@ def hand(base: str) -> Case:
         Joint.of("r1", "hinge", "right", "palm", position_m=(0, -0.05, 0), stiffness=2.0, lower=-0.1, **same),
         Joint.of("r2", "hinge", "right_tip", "right", position_m=(0.08, 0, 0), stiffness=2.0, upper=0.15, **same),
         Joint.of("r3", "fixed", "nail", "right_tip", position_m=(0.02, 0.0, 0.0), quat_wxyz=(0.9, 0.1, 0.2, 0.3)),
+        Joint.of("r4", "fixed", "part", "right_tip", position_m=(-0.07, 0.005, 0.0)),
     )
     chain = Chain(name="hand", root="palm", base=base, joints=joints)
     turns = torch.linspace(0, 5.5, 8, dtype=F64)
@@ -71,9 +74,9 @@ def hand(base: str) -> Case:
     ball = replace(ball_body(0.012, 0.1), centers=centers[None], radii=torch.full((1, 8), 0.012, dtype=F64))
     world = chained(chain, *bodies, ball, step_s=0.004)
     world = replace(world, ground_offset=batch(-0.04))
-    state = still(7)
-    state.position_m[:, 6] = torch.tensor([0.1, 0.0, -0.002])
-    state.velocity_m_s[:, 6, 1] = 0.1
+    state = still(8)
+    state.position_m[:, 7] = torch.tensor([0.1, 0.0, -0.002])
+    state.velocity_m_s[:, 7, 1] = 0.1
     state = with_joints(world, state, {"l1": -0.05, "r2": 0.1}, {"r1": 0.3})
     values = torch.tensor([[0.0, 0.0, 0.0, 0.0], [-0.4, 0.01, 0.4, 0.3], [-0.5, -0.01, 0.3, 0.2]], dtype=F64)
     commands: dict[str, Any] = {"hand": JointCommand.targets(batch([0.0, 0.06, 0.1]), values[None], "cubic")}
