@@ -35,7 +35,7 @@ from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, Pose
 from processor_clock import charge_processors
 from store import Store
 
-HALF_M, MASS_KG, ROUNDING_M = 0.03, 0.108, 0.001
+HALF_M, MASS_KG, ROUNDING_M = 0.03, 0.108, 0.0003
 FRICTION, TIP_FRICTION = 0.2, 0.7
 HOME = {
     "if_mcp": 0.5, "if_rot": -0.75, "if_pip": 0.75, "if_dip": 0.25, "mf_mcp": 0.5, "mf_rot": 0.0, "mf_pip": 0.75,
@@ -77,7 +77,7 @@ def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
         '<include file="leap_components/params_hand.xml"/><worldbody><body name="leap_hand">'
         '<include file="leap_components/leap_hand.xml"/></body></worldbody></mujoco>'
     )
-    tips = {f"{finger}_ds": TIP_FRICTION for finger in ("if", "mf", "rf", "th")}
+    tips = {f"{finger}_ds/3": TIP_FRICTION for finger in ("if", "mf", "rf", "th")}  # the last part of each
     task = HandTask.model_validate(
         {
             "robot": {"file": "xml/hand.xml", "quat_wxyz": ROOT_WXYZ, "friction": tips, "corners": given.corners},

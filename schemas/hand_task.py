@@ -43,11 +43,11 @@ class HandSection(TaskSection):
     quat_wxyz: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """Orientation of its root link, to world."""
     friction: dict[str, Friction] = {}
-    """Friction of the object and single links, by link [1]; by default that of the model."""
+    """Friction of the object and single links, or parts of links as link/1, link/2, ... [1]; by default the model's."""
     apart: tuple[str, ...] = ()
     """Links that the object never touches; predictions without their shapes are faster."""
-    corners: Annotated[int, Field(ge=4, le=200)] = 16
-    """Largest number of corners of a link's convex shape."""
+    corners: Annotated[int, Field(ge=4, le=200)] = 24
+    """Largest number of corners of the convex shape of each part of a link."""
 
 
 class HandServoSection(TaskSection):
@@ -101,6 +101,10 @@ class HandCostsSection(TaskSection):
 
     position_m: Length = 0.03
     """An error of the object's position that costs 1 [m]."""
+    keep_m: Length = 0.03
+    """Distance of the object from where it is wanted beyond which it may be lost [m]."""
+    lost_m: Length = 0.01
+    """A further distance that costs 1 [m]."""
     turn_deg: Annotated[float, Field(gt=0, le=3600)] = 30.0
     """An error of its turn that costs 1 [deg]."""
     path: Share = 1.0
@@ -243,18 +247,19 @@ def files_of(task: AnyTask) -> tuple[str, ...]:
     return (task.robot.file, *([task.plant.scene] if task.plant.scene else []))
 
 
-def require_joints(task: HandTask, known: tuple[str, ...], links: tuple[str, ...]) -> str:
+def require_joints(task: HandTask, known: tuple[str, ...], links: tuple[str, ...], parts: tuple[str, ...] = ()) -> str:
     """Return what is wrong with the names of a task, in words; empty for nothing.
 
     Args:
         task: The task.
         known: Names of the joints that move.
         links: Names of the links.
+        parts: Names of their further parts.
     """
     given = (
         ("[limits] joints", task.limits.joints, "joint", known),
         ("[start] joints", task.start.joints, "joint", known),
-        ("[robot] friction", task.robot.friction, "link", links),
+        ("[robot] friction", task.robot.friction, "link", (*links, *parts)),
         ("[robot] apart", task.robot.apart, "link", links),
     )
     for place, names, kind, legal in given:

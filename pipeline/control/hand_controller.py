@@ -66,7 +66,7 @@ class HandController(PlanningController):
             )
 
         worlds = drawn_worlds(model, draws, seed, where, planned)
-        sampling = Mppi(task.planner.samples, noise=NOISE, alike=1)
+        sampling = Mppi(task.planner.samples, noise=NOISE, alike=1, averaged=False)
         super().__init__(task.planner, worlds, solver_of(solver, sampling), where, seed)
 
     @property

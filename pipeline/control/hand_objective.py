@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -18,8 +19,8 @@ from .hand_world import HandWorld
 from .horizon import Array, Forecast, Targets
 from .objective import Draw, Worlds, costs_of
 
-FRAMES = 4
-"""Frames of a piece whose errors count."""
+FRAMES = 5
+"""Largest number of frames of a piece whose errors count."""
 SINGLE = (0.1, 0.8)
 """Smallest and largest standard deviation of changes of a few joints, in units of the bound."""
 CHANGED_SHARE = 0.25
@@ -74,7 +75,8 @@ class HandObjective:
         motion, targets = self._predicted(values, draws)
         place = motion.position_m[:, 1:, self.hand.object] - torch.tensor(self.hand.task.wanted_m, dtype=torch.float64)
         turn = turn_to(motion.quat_wxyz[:, 1:, self.hand.object], torch.as_tensor(self.goal_wxyz))
-        errors = torch.cat((place / costs.position_m, turn / math.radians(costs.turn_deg)), -1)
+        lost = ((place.square().sum(-1, keepdim=True) + 1e-24).sqrt() - costs.keep_m).clamp_min(0.0)
+        errors = torch.cat((place / costs.position_m, lost / costs.lost_m, turn / math.radians(costs.turn_deg)), -1)
         weight = torch.full((errors.shape[1],), costs.path / errors.shape[1], dtype=torch.float64)
         weight[-1] += 1.0
         speeds = targets.diff(dim=1) / torch.as_tensor(np.diff(self.times_s))[:, None]
@@ -121,7 +123,7 @@ class HandObjective:
         """See :class:`PlanObjective`."""
         motion, _ = self._predicted(values[None], torch.zeros(1, dtype=torch.long))
         return Forecast(
-            times_s=self._frames().numpy() + self.times_s[0],
+            times_s=self._frames.numpy() + self.times_s[0],
             position_m=motion.position_m[0, :, self.hand.object].numpy(),
             quat_wxyz=motion.quat_wxyz[0, :, self.hand.object].numpy(),
         )
@@ -130,16 +132,19 @@ class HandObjective:
         """Return the predicted motion of sequences (b, N, joints) under draws (b,), and the targets."""
         targets = self.within_limits(values)
         times = torch.as_tensor(self.times_s - self.times_s[0])
-        state = State(*(part.expand(len(values), *part.shape[1:]) for part in self.state.tensors))
         world = self.worlds.batch(tuple(draws.tolist()) if self.draws > 1 else ())
         command = JointCommand.targets(times[None], targets)
-        return rollout(world, state, self._frames(), {self.hand.chain.name: command}), targets
+        return rollout(world, self.state, self._frames, {self.hand.chain.name: command}), targets
 
+    @cached_property
     def _frames(self) -> Tensor:
-        """Return the times of the predicted frames, from the state on [s]."""
-        grid = np.linspace(0, 1, FRAMES + 1)[1:]
-        pieces = [a + (b - a) * grid for a, b in zip(self.times_s[:-1], self.times_s[1:], strict=True)]
-        return torch.as_tensor(np.concatenate(([0.0], np.concatenate(pieces) - self.times_s[0])))
+        """Times of the predicted frames, from the state on [s]: up to `FRAMES` in a piece, at whole steps."""
+        step_s, found = self.hand.task.planner.step_s, [0.0]
+        for length in np.diff(self.times_s):
+            steps = max(1, math.ceil(length / step_s - 1e-6))
+            frames = min(FRAMES, steps)
+            found += (found[-1] + length * np.round(np.arange(1, frames + 1) * steps / frames) / steps).tolist()
+        return torch.tensor(found, dtype=torch.float64)
 
 
 def turn_to(quat_wxyz: Tensor, goal_wxyz: Tensor) -> Tensor:

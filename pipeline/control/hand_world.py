@@ -118,7 +118,7 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
     free_object(model.file, task.object, task.source)
     hand = _hand(task)
     moving = tuple(joint.name for joint in hand.joints)
-    wrong = require_joints(task, moving, tuple(link.name for link in hand.links))
+    wrong = require_joints(task, moving, tuple(link.name for link in hand.links), _parts(hand))
     if wrong:
         raise InputDataError(f"{task.source}: {wrong}", todo="correct the name or the range.")
     _require_servos(task, hand)
@@ -146,6 +146,16 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
     require_apart(world, begun, f"{task.source}, the start")
     _require_room(found)
     return found
+
+
+def _parts(hand: Articulation) -> tuple[str, ...]:
+    """Return the names of the further parts of links."""
+    return tuple(_part(link.name, k) for link in hand.links for k in range(1, len(link.geometry)))
+
+
+def _part(link: str, number: int) -> str:
+    """Return the name of a part of a link; the first has that of the link."""
+    return f"{link}/{number}" if number else link
 
 
 def _hand(task: HandTask) -> Articulation:
@@ -197,14 +207,17 @@ def _shaped(
         first, *others = [_with_hull(link, balls) for balls in shapes.get(link.name, ())] or [link]
         bodies.append(first)
         for number, part in enumerate(others, 1):
-            name = f"{link.name}/{number}"
+            name = _part(link.name, number)
             more.append(replace(part, name=name, mass=0 * link.mass, inertia=0 * link.inertia))
             joints.append(Joint.of(f"{name}/fixed", "fixed", name, link.name))
-    every = [
-        replace(body, material=f"{LINK} {body.name}" if body.name in task.robot.friction else None)
-        for body in (*bodies, *more)
-    ]
+    every = [replace(body, material=_material(task, body.name)) for body in (*bodies, *more)]
     return replace(chain, joints=(*chain.joints, *joints)), every
+
+
+def _material(task: HandTask, part: str) -> str | None:
+    """Return the material of a part: its own, or that of its link, where the task gives it a friction."""
+    owner = next((name for name in (part, part.partition("/")[0]) if name in task.robot.friction), None)
+    return None if owner is None else f"{LINK} {owner}"
 
 
 def _with_hull(body: Body, balls: Balls) -> Body:

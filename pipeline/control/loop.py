@@ -159,7 +159,7 @@ class Commander:
         controller, interval = self._controller, self._controller.interval_s
         self._acting = self._waiting.arrived(now_s) or self._acting
         if self._waiting.free:
-            plan = controller.plan(state, now_s if self._clock == "ideal" else now_s + interval)
+            plan = controller.plan(state, now_s + self._waiting.expected_s)
             if plan is not None:
                 late = self._waiting.begin(now_s, plan)
                 note_plan(self._recording, controller, plan, late, self._knots)
@@ -187,9 +187,16 @@ class Waiting:
     def __init__(self, interval_s: float, clock: ClockName) -> None:
         self._interval_s, self._clock = interval_s, clock
         self._plan: ControlPlan | None = None
-        self._ready_s = 0.0
+        self._ready_s = self._last_s = 0.0
         self.late = 0
         """Plans that took longer than a command."""
+
+    @property
+    def expected_s(self) -> float:
+        """Time after which the next plan will act, if it takes as long as the last one [s]."""
+        if self._clock == "ideal":
+            return 0.0
+        return self._interval_s * max(1, math.ceil(self._last_s / self._interval_s - 1e-9))
 
     @property
     def free(self) -> bool:
@@ -202,7 +209,7 @@ class Waiting:
         if self._clock == "ideal":
             self._ready_s = now_s
             return False
-        self._ready_s = now_s + max(plan.wall_s, self._interval_s)
+        self._ready_s, self._last_s = now_s + max(plan.wall_s, self._interval_s), plan.wall_s
         late = plan.wall_s > self._interval_s
         self.late += late
         return late

@@ -72,6 +72,8 @@ class Mppi:
     """Smallest and largest standard deviation of changed plans in units of the bound."""
     alike: int = NOISE_PIECES
     """Pieces that noise changes alike."""
+    averaged: bool = True
+    """Whether the mean competes; its rollout alone takes as long as one of as many samples as there are cores."""
 
     def solve(self, objective: Objective, warm: Tensor, propose: Draw, rng: np.random.Generator) -> Solution:
         """See :class:`Solver`."""
@@ -86,8 +88,10 @@ class Mppi:
         best = values[costs.argmin()]
         near = self._changed(best, max(self.samples - first - 1, 1), objective, rng)
         later = objective.costs(near)
-        mean = _mean(torch.cat((best[None], near)), torch.cat((costs.min()[None], later)))
-        values, costs = torch.cat((values, near, mean[None])), torch.cat((costs, later, objective.costs(mean[None])))
+        values, costs = torch.cat((best[None], near)), torch.cat((costs.min()[None], later))
+        if self.averaged:
+            mean = _mean(values, costs)[None]
+            values, costs = torch.cat((values, mean)), torch.cat((costs, objective.costs(mean)))
         chosen = costs.argmin()
         return Solution(values[chosen], float(costs[chosen]))
 

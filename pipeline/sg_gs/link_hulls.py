@@ -16,7 +16,7 @@ from .link_spheres import mesh_of_part
 
 Array = NDArray[np.float64]
 Balls = tuple[Array, Array]
-ROUNDING_M = 0.0005
+ROUNDING_M = 0.0003
 """Largest radius of the balls, by which corners are rounded [m]: fingers hold an object by their edges."""
 _SHARE = 0.25
 """Largest radius in units of the smallest extent of a shape."""
@@ -28,19 +28,16 @@ _OVER = 2.0
 def link_hulls(articulation: Articulation, corners: int) -> dict[str, list[Balls]]:
     """Return centres (n, 3) and radii (n,) [m] of the balls of each convex shape of a link, in its frame.
 
-    The root, which does not move, keeps all its parts; any other link becomes one shape, the hull of its parts.
+    Each part of a link is a shape: the common hull of several fills the hollows between them, in which an object lies.
 
     Args:
         articulation: The articulated body.
         corners: Largest number of balls of a shape.
     """
-    found = {}
-    for number, link in enumerate(articulation.links):
-        parts = [mesh_of_part(part).vertices for part in link.geometry]
-        if number and parts:
-            parts = [np.concatenate(parts)]
-        found[link.name] = [rounded_hull(points, corners) for points in parts]
-    return found
+    return {
+        link.name: [rounded_hull(mesh_of_part(part).vertices, corners) for part in link.geometry]
+        for link in articulation.links
+    }
 
 
 def rounded_hull(points: Array, corners: int) -> Balls:

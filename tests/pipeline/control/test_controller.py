@@ -8,6 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cgwm.pipeline.control.controller import Controller, ControlState
+from cgwm.pipeline.control.horizon import Targets
+from cgwm.pipeline.control.loop import Waiting
+from cgwm.pipeline.control.planning import ControlPlan
 from cgwm.schemas import NotConvergedError, UsageError
 from helpers import fused_host
 from helpers.pushing import push_task, pushed_model
@@ -112,3 +115,14 @@ def test_wrong_arguments_are_refused() -> None:
         Controller(pushed_model(), push_task(), draws=-1)
     with pytest.raises(UsageError, match="before the first plan"):
         Controller(pushed_model(), push_task()).forecast()
+
+
+def test_a_plan_is_made_for_the_command_by_which_the_last_one_would_have_come() -> None:
+    targets = Targets(times_s=np.zeros(1), values_m=np.zeros((1, 2)))
+    plan = ControlPlan(state_s=0.0, acts_s=0.02, targets=targets, cost=0.0, wall_s=0.03, cpu_s=0.03)
+    waiting = Waiting(0.02, "real")
+    assert waiting.expected_s == 0.02
+    assert waiting.begin(0.0, plan) and waiting.arrived(0.02) is None and waiting.arrived(0.04) is plan
+    assert waiting.expected_s == 0.04
+    assert not waiting.begin(0.04, replace(plan, wall_s=0.01)) and waiting.expected_s == 0.02
+    assert Waiting(0.02, "ideal").expected_s == 0.0

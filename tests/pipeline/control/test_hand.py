@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -98,6 +99,35 @@ def test_a_link_that_is_apart_touches_nothing(folder: Path, model: Model) -> Non
     hand = hand_world(model, hand_task(folder, robot={"apart": ("tip",)}))
     counts = [body.radii.shape[1] for body in hand.world.bodies]
     assert counts[:3] == [8, 8, 0] and [hand.world.body_names[k] for k, _ in hand.world.pairs if k != 3] == ["arm"]
+
+
+def test_each_part_of_a_link_is_a_shape_that_may_have_a_friction_of_its_own(folder: Path, model: Model) -> None:
+    """The common hull of a hook would fill its hollow, in which an object can lie."""
+    one = '<geom type="box" size="0.04 0.006 0.015" pos="0.04 0 0" mass="0.05"/>'
+    hook = one + '<geom type="box" size="0.006 0.03 0.015" pos="0.08 0.03 0" mass="0.01"/>'
+    (folder / "parts.xml").write_text((folder / "hand.xml").read_text().replace(one, hook))
+    robot = {"file": "parts.xml", "friction": {"arm": 0.5, "arm/1": 0.9}}
+    world = hand_world(model, hand_task(folder, robot=robot)).world
+    assert world.body_names == ["palm", "arm", "tip", "arm/1", "cube"]
+    assert [float(world.law_of(k, 4).friction) for k in (1, 3)] == [0.5, 0.9]
+    low, high = (getattr(world.bodies[1].centers[0], side)(0).values for side in ("min", "max"))
+    assert (high - low)[1] < 0.012  # the arm alone, not the hull of both
+    with pytest.raises(InputDataError, match="no link 'arm/2'"):
+        hand_world(model, hand_task(folder, robot=robot | {"friction": {"arm/2": 0.9}}))
+
+
+def test_an_object_beyond_what_is_kept_costs_its_further_distance(folder: Path, model: Model) -> None:
+    costs = []
+    for lost_m in (1e5, 0.01):
+        controller = HandController(model, hand_task(folder, costs={"keep_m": 0.02, "lost_m": lost_m}))
+        state = begun(controller)
+        there = replace(state, position_m=state.position_m + np.array([0.0, 0.03, 0.0]))
+        objective, warm = controller._objective(there, 0.0)
+        costs.append(float(objective.costs(warm[None])[0]))
+    away = objective.forecast(warm).position_m[1:] - np.array(controller.task.wanted_m)
+    further = np.maximum(np.linalg.norm(away, axis=1) - 0.02, 0) / 0.01
+    assert further[-1] > 0.9
+    assert costs[1] - costs[0] == pytest.approx((further**2).mean() + further[-1] ** 2, rel=1e-6)
 
 
 def test_no_target_exceeds_range_or_speed_whatever_the_noise(controller: HandController) -> None:
