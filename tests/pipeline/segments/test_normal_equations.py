@@ -11,6 +11,7 @@ import pytest
 import torch
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.parameters import Parameter
+from cgwm.pipeline.segments import variance_components
 from cgwm.pipeline.segments.candidates import Variant
 from cgwm.pipeline.segments.held_out_gain import FOLDS, ContactLinearization
 from cgwm.pipeline.segments.linearization import Linearization, _fits, _linearization, eliminate, layout, sums, widths
@@ -20,10 +21,12 @@ from cgwm.pipeline.segments.repeated_forces import PRIOR_STD, _frames, _held_out
 from cgwm.pipeline.segments.restricted_likelihood import Scored
 from cgwm.pipeline.segments.variance_components import LONGEST, _climb
 from cgwm.pipeline.trajectories.correlated_noise import WindowErrors
+from cgwm.pipeline.trajectories.innovations import FALLS, CorrelatedNoise
 from cgwm.pipeline.trajectories.observations import Observations
 
 EPISODE = np.array([0, 0, 1, 2, 2, 3])
 GROUP = np.array([0, 0, 0, 1, 1, 1])
+ORDERS = list(FALLS)
 
 
 def parameter(shared: Any, width: float) -> Parameter:
@@ -280,6 +283,46 @@ def test_a_step_that_overshoots_is_damped_until_it_climbs() -> None:
 
     end, value = _climb(scored, np.array([0.0]), np.array([-5.0]), np.array([5.0]))
     assert value == max(-10 * abs(one - 1.0) for one in tried) and abs(float(end[0]) - 1.0) < 0.35
+
+
+def component_choice(monkeypatch: pytest.MonkeyPatch, gains: tuple[float, float, float], share: float) -> Any:
+    """Return what is chosen of white and fast noise, a slow process and a sway with given gains, and the starts."""
+    log: list[tuple[int, tuple[str, ...], float]] = []
+    found = {
+        (): CorrelatedNoise(share, 0.01, 1.0, order=0.5),
+        ("slow",): CorrelatedNoise(share, 0.01, 1.0, slow=0.5, slow_time_s=0.2, order=0.5),
+        ("sway",): CorrelatedNoise(share, 0.01, 1.0, sway=2.0, order=0.5),
+        ("slow", "sway"): CorrelatedNoise(share, 0.01, 1.0, slow=0.5, slow_time_s=0.2, sway=2.0, order=0.5),
+    }
+    values = {(): 100.0, ("slow",): 100 + gains[0] / 2, ("sway",): 100 + gains[1] / 2}
+    values["slow", "sway"] = 100 + gains[2] / 2
+
+    def climbed(_: object, starts: Any, kinds: Any, order: float) -> tuple[CorrelatedNoise, float]:
+        log.append((len(starts), tuple(kinds), order))
+        return found[tuple(kinds)]._replace(order=order), values[tuple(kinds)] - (order != ORDERS[0]) * 5
+
+    monkeypatch.setattr(variance_components, "_climbed", climbed)
+    contrasts: Any = SimpleNamespace(times_s=torch.tensor([[0.0, 0.3], [0.0, 0.5]], dtype=torch.float64))
+    known = CorrelatedNoise(0.0, 0.01, 1.0)
+    return variance_components.variance_components(contrasts, known, (0, 1)), log, known
+
+
+@pytest.mark.parametrize("slow", [True, False])
+@pytest.mark.parametrize("sway", [True, False])
+def test_components_without_evidence_are_left_out(slow: bool, sway: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    least = variance_components.LIMITS
+    first = least.evidence + (1.0 if slow else -1.0)
+    second = least.sway_evidence + (1.0 if sway else -1.0)
+    gains = (first, second, first + second)
+    (best, still, gain, sway_gain), log, known = component_choice(monkeypatch, gains, 0.0)
+    assert (best.slow > 0, best.sway > 0) == (slow, sway)
+    assert gain == pytest.approx(first if slow else 0.0) and sway_gain == pytest.approx(second if sway else 0.0)
+    assert still.sway == 0.0 and (still.slow > 0) == slow and (slow or still is known)
+    if not slow and not sway:
+        assert best is known
+    kinds = [kind for _, kind, _ in log]
+    assert kinds == [()] * len(ORDERS) + [("slow",), ("slow", "sway") if slow else ("sway",)]
+    assert [order for _, _, order in log] == [*ORDERS, ORDERS[0], ORDERS[0]] and log[len(ORDERS)][0] >= 2
 
 
 def test_layouts_do_not_depend_on_the_order_of_segments() -> None:
