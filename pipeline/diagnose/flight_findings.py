@@ -212,8 +212,8 @@ class _Search:
         counts as an error until this effect is found.
         """
         told, law = self.told(chosen.world, self.errors(chosen.world) if chosen.names else errors)
-        swayless = told is None or bool(errors.noise_model.position.sway and not told.noise_model.position.sway)
-        if told is None or swayless or _differ(chosen, told):
+        # accelerations of the flights' own that only show beside the effects are part of the errors, too
+        if told is None or _sways(told) != _sways(errors) or _differ(chosen, told):
             beside = self.beside(told)
             return told, law, beside, self.selection(beside)
         return replace(told, noise_model=errors.noise_model), law, beside, chosen
@@ -275,6 +275,11 @@ class _Search:
             common_share=share,
             own_law=own_law,
         )
+
+
+def _sways(errors: SlowErrors) -> bool:
+    """Return whether flights have accelerations of their own among the errors."""
+    return errors.noise_model.position.sway > 0
 
 
 def _differ(chosen: FlightSelection, errors: SlowErrors) -> bool:

@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cgwm.pipeline.diagnose import flight_findings
 from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.flight_equals import _with_scales_of_sessions
+from cgwm.pipeline.diagnose.flight_findings import _Search
 from cgwm.pipeline.diagnose.group_values import _Scored, _unlike
 from cgwm.pipeline.diagnose.robust_fit import robust_repetition
 from cgwm.pipeline.diagnose.score_test import ScoreTest
@@ -16,6 +18,8 @@ from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.parameters import Parameter
 from cgwm.pipeline.segments.candidates import Candidate, Variant
 from cgwm.pipeline.segments.linearization import Linearization
+from cgwm.pipeline.segments.slow_errors import SlowErrors
+from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, NoiseModel
 from numpy.typing import NDArray
 
 
@@ -118,3 +122,23 @@ def test_episodes_of_which_no_flight_was_searched_are_named() -> None:
     assert [text.split(":")[0] for text in noisy_warnings(prepared, findings)] == ["b"]
     findings.flight.prepared.flight = flights(0, 1, 2)
     assert noisy_warnings(prepared, findings) == []
+
+
+@pytest.mark.parametrize(("before", "beside", "searched"), [(0.0, 2.0, True), (2.0, 0.0, True), (2.0, 2.1, False)])
+def test_flights_are_searched_again_where_their_own_accelerations_come_or_go(
+    monkeypatch: pytest.MonkeyPatch, before: float, beside: float, searched: bool
+) -> None:
+    """A tilt of each episode's own that only shows beside a drag is a part of the errors then, and has a size."""
+    errors, told = (
+        SlowErrors(NoiseModel(CorrelatedNoise(sway=sway), CorrelatedNoise()), NoiseModel(), 9.0, 20.0, ())
+        for sway in (before, beside)
+    )
+    search: Any = _Search
+    monkeypatch.setattr(search, "errors", lambda *_: told)
+    monkeypatch.setattr(search, "told", lambda _, __, errors: (errors, None))
+    monkeypatch.setattr(search, "beside", lambda _, errors: errors)
+    monkeypatch.setattr(search, "selection", lambda _, errors: errors)
+    monkeypatch.setattr(flight_findings, "_differ", lambda *_: False)
+    chosen: Any = SimpleNamespace(world=None, names=["linear_drag"])
+    found = search(None, None, ()).settled(errors, errors, chosen)
+    assert (found[3] is told) == searched
