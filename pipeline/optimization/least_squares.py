@@ -74,6 +74,8 @@ class Policy:
     """The same as a share of the cost; the larger of the two counts."""
     step_limit: float = math.inf
     """Maximum change of a state in one step, in the problem's units."""
+    longest: float = math.inf
+    """Maximum change of a parameter in one step."""
     small_step: float = 0.0
     """Change of a state in an accepted step below which a descent ends, in the problem's units."""
     linearise_end: bool = True
@@ -214,7 +216,9 @@ def _trials(descent: Descent, policy: Policy, rows: Rows) -> _Trials:
     for factor in policy.factors:
         damping = factor * descent.damping[rows.groups]
         reduced = normal.eliminated(damping[rows.owner] if policy.damp_states else None, problem.damping_unit)
-        step = _step(reduced, here.values, box, damping, rows)
+        step = _step(problem, reduced, here.values, box, damping, rows)
+        if policy.longest < math.inf:
+            step = step * (policy.longest / step.abs().amax(1, keepdim=True)).clamp_max(1.0)
         for share in policy.shares:
             values = box.clamped(here.values + share * step)
             change = reduced.following((values - here.values)[rows.owner], share)
@@ -230,7 +234,7 @@ def _trials(descent: Descent, policy: Policy, rows: Rows) -> _Trials:
     return _Trials(point=joined, rows=rows.repeated(len(points)), damping=torch.stack(dampings), size=size)
 
 
-def _step(reduced: Reduced, values: Tensor, box: Box, damping: Tensor, rows: Rows) -> Tensor:
+def _step(problem: Problem, reduced: Reduced, values: Tensor, box: Box, damping: Tensor, rows: Rows) -> Tensor:
     """Return the damped step (g, P) of the parameters (g, P); those that a bound stops do not move."""
     count = len(values)
     if not values.shape[1]:
@@ -238,7 +242,9 @@ def _step(reduced: Reduced, values: Tensor, box: Box, damping: Tensor, rows: Row
     matrix = by_group(reduced.information, rows.owner, count) + torch.diag_embed(box.information)
     slope = by_group(reduced.score, rows.owner, count) + box.information * (box.centre - values)
     moving = box.moving(values, slope).to(values)
-    system = damped(matrix, damping) * moving[:, :, None] * moving[:, None] + torch.diag_embed(1 - moving)
+    system = damped(matrix, damping, floor=problem.least_information) * moving[:, :, None] * moving[
+        :, None
+    ] + torch.diag_embed(1 - moving)
     return solved(system, (slope * moving)[..., None])[..., 0]
 
 

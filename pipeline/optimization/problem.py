@@ -313,16 +313,16 @@ class NormalEquations:
         return self.state_slope.isfinite().all(-1) & self.slope.isfinite().all(-1)
 
 
-def damped(matrix: Tensor, damping: Tensor, unit: Tensor | None = None) -> Tensor:
+def damped(matrix: Tensor, damping: Tensor, unit: Tensor | None = None, floor: float = FLOOR) -> Tensor:
     """Return matrices (B, N, N) with dampings (B,) added to their diagonals.
 
     Args:
         matrix: The matrices.
         damping: The dampings.
-        unit: What they multiply, shape (N,) (Levenberg, 1944); by default the diagonal itself, at least `FLOOR`
-            (Marquardt, 1963).
+        unit: What they multiply, shape (N,) (Levenberg, 1944); by default the diagonal itself (Marquardt, 1963).
+        floor: Minimum of the diagonal then.
     """
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(FLOOR) if unit is None else unit
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(floor) if unit is None else unit
     return matrix + torch.diag_embed(damping[:, None] * diagonal)
 
 
@@ -345,6 +345,8 @@ class Problem(ABC):
     """Unit of each coordinate of a state's step for the policy's limits, shape (S,)."""
     damping_unit: Tensor | None = None
     """What the damping of states multiplies, shape (S,); by default the diagonal of their information."""
+    least_information: float = FLOOR
+    """Minimum information of a parameter that its damping multiplies."""
     derivatives_with_costs: bool = False
     """Whether derivatives are computed at every trial, because they cost little more than the cost alone."""
 

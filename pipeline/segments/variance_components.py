@@ -6,8 +6,11 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from ..optimization.least_squares import Policy, descend
+from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..trajectories.innovations import FALLS, CorrelatedNoise
 from .flight_contrasts import FlightContrasts
 from .restricted_likelihood import Components, RestrictedLikelihood, Scored
@@ -27,9 +30,12 @@ LEAST_STD = 0.02
 STEPS = 30
 """Maximum number of steps of a climb."""
 LONGEST, ENOUGH = 1.5, 0.01
-"""Longest step of a coordinate, and expected gain of the log-likelihood at which a climb ends."""
+"""Longest step of a coordinate, and gain of the log-likelihood in a step at which a climb ends."""
 LEAST_INFORMATION = 0.05
 """Information of a coordinate that is damped at least: that of a component without any influence is 0."""
+POLICY = Policy(
+    iterations=STEPS, attempts=6, damping=0.1, up=5.0, least_damping=2e-4, absolute=2 * ENOUGH, longest=LONGEST
+)
 
 
 def variance_components(
@@ -77,7 +83,7 @@ def _climbed(
 ) -> tuple[CorrelatedNoise, float]:
     """Return the likeliest noise model with components of some kinds, and its restricted log-likelihood.
 
-    Scoring with average information, damped; it is no least-squares problem, and is not of `optimization`.
+    Damped scoring with average information, whose steps are those of a least-squares problem.
     """
     std, times = (math.log(LEAST_STD), 6.0), (math.log(FASTEST_S), math.log(FAST_S))
     bounds = [std, std, times]
@@ -86,8 +92,7 @@ def _climbed(
     if "sway" in kinds:
         bounds.append((-20.0, 20.0))
     low, high = np.transpose(bounds)
-    ends = [_climb(lambda z: _scored(likelihood, z, kinds, order), np.array(start), low, high) for start in starts]
-    best, value = max(ends, key=lambda end: end[1])
+    best, value = _climb(lambda z: _scored(likelihood, z, kinds, order), np.array(starts), low, high)
     return Components.of(best, kinds, order).noise(likelihood.level), value
 
 
@@ -99,23 +104,32 @@ def _scored(likelihood: RestrictedLikelihood, z: Array, kinds: Sequence[str], or
         return Scored(-np.inf, np.zeros(len(z)), np.eye(len(z)))
 
 
-def _climb(scored: Callable[[Array], Scored], start: Array, low: Array, high: Array) -> tuple[Array, float]:
-    """Return the coordinates of the largest likelihood within bounds, and its logarithm."""
-    z = start.clip(low, high)
-    at, damping = scored(z), 0.1
-    for _ in range(STEPS):
-        free = ((z > low) | (at.slope > 0)) & ((z < high) | (at.slope < 0))
-        slope = np.where(free, at.slope, 0.0)
-        matrix = at.information * np.outer(free, free)
-        own = np.maximum(np.diag(matrix), LEAST_INFORMATION)
-        step = np.linalg.solve(matrix + np.diag(damping * own + np.where(free, 1e-9, 1.0)), slope)
-        step *= min(1.0, LONGEST / max(np.abs(step).max(), 1e-9))
-        if 0.5 * float(slope @ step) < ENOUGH:
-            break
-        moved = (z + step).clip(low, high)
-        there = scored(moved)
-        if there.value > at.value:
-            z, at, damping = moved, there, damping / 5
-        else:
-            damping = max(5 * damping, 1e-3)
-    return z, at.value
+def _climb(scored: Callable[[Array], Scored], starts: Array, low: Array, high: Array) -> tuple[Array, float]:
+    """Return the coordinates (k,) of the largest likelihood within bounds, and its logarithm, from starts (n, k)."""
+    bounds = Box.within(torch.as_tensor(np.stack([low, high], 1)))
+    problem = _Likelihood(scored, bounds.at(torch.zeros(len(starts), dtype=torch.long)))
+    end = descend(problem, Point(values=problem.box.clamped(torch.as_tensor(starts))), POLICY)
+    best = int(end.cost.argmin())
+    return end.point.values[best].numpy(), -0.5 * float(end.cost[best])
+
+
+class _Likelihood(Problem):
+    """Starts (n), each a group without a state, whose cost is -2 log of the likelihood.
+
+    Args:
+        scored: The likelihood at coordinates (k,).
+        box: Bounds of the coordinates, for each start.
+    """
+
+    derivatives_with_costs = True
+    least_information = LEAST_INFORMATION
+
+    def __init__(self, scored: Callable[[Array], Scored], box: Box) -> None:
+        self._scored, self.box, self.owner = scored, box, torch.arange(len(box.low))
+
+    def linearised(self, point: Point, rows: Rows) -> NormalEquations:
+        """Return average information, slope and -2 log of the likelihood at points."""
+        found = [self._scored(z.numpy()) for z in point.values[rows.owner]]
+        information, slope = (np.array([getattr(one, name) for one in found]) for name in ("information", "slope"))
+        cost = torch.tensor([-2 * one.value for one in found], dtype=torch.float64)
+        return NormalEquations.of_parameters(torch.as_tensor(information), torch.as_tensor(slope), cost)

@@ -103,6 +103,7 @@ SEGMENT_NUMERICS = {
         "variance_components.STEPS",
         "variance_components.LONGEST, ENOUGH",
         "variance_components.LEAST_INFORMATION",
+        "variance_components.POLICY",
     ),
     "start of a descent, or lengths of a step that are tried": (
         "impact_fit.SHARES",

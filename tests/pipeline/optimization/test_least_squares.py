@@ -5,7 +5,7 @@ import pytest
 import torch
 from cgwm.pipeline.optimization.least_squares import Descent, Policy, Stop, descend
 from cgwm.pipeline.optimization.levenberg_marquardt import minimise
-from cgwm.pipeline.optimization.problem import FLOOR, Box, NormalEquations, Point, Problem, Rows
+from cgwm.pipeline.optimization.problem import FLOOR, Box, NormalEquations, Point, Problem, Rows, damped
 from torch import Tensor
 from torch.autograd.functional import jacobian
 from torch.func import vmap
@@ -235,3 +235,9 @@ def test_steps_of_states_are_limited_and_small_ones_end_a_descent() -> None:
     assert end.reasons == [Stop.SMALL_STEP, Stop.NO_LOWER_COST]
     assert end.accepted.tolist() == [1, 4]
     assert end.point.states[0][:, 0].tolist() == pytest.approx([0.3, 2.0])
+
+
+def test_damping_multiplies_a_least_information() -> None:
+    matrix = torch.diag(torch.tensor([4.0, 0.01], dtype=torch.float64))[None]
+    found = damped(matrix, torch.tensor([0.5], dtype=torch.float64), floor=0.2)
+    assert found[0].diagonal().tolist() == pytest.approx([6.0, 0.11])

@@ -262,7 +262,7 @@ def test_a_likelihood_is_climbed_to_its_top_within_bounds(best: tuple[float, flo
         matrix = np.array([[900.0, 100.0], [100.0, 400.0]])
         return Scored(float(-0.5 * (z - top) @ matrix @ (z - top)), matrix @ (top - z), 1.5 * matrix)
 
-    end, value = _climb(scored, np.array([-1.5, 9.0]), low, high)
+    end, value = _climb(scored, np.array([[-1.5, 9.0]]), low, high)
     assert tried[0].tolist() == [-1.5, 2.0]
     assert np.abs(np.diff(tried[:2], axis=0)).max() <= LONGEST + 1e-12
     matrix = np.array([[900.0, 100.0], [100.0, 400.0]])
@@ -281,7 +281,7 @@ def test_a_step_that_overshoots_is_damped_until_it_climbs() -> None:
         tried.append(float(z[0]))
         return Scored(float(-10 * abs(z[0] - 1.0)), np.sign(1.0 - z) * 10, np.array([[12.0]]))
 
-    end, value = _climb(scored, np.array([0.0]), np.array([-5.0]), np.array([5.0]))
+    end, value = _climb(scored, np.array([[0.0]]), np.array([-5.0]), np.array([5.0]))
     assert value == max(-10 * abs(one - 1.0) for one in tried) and abs(float(end[0]) - 1.0) < 0.35
 
 
