@@ -65,8 +65,8 @@ class Channel:
     """Information of each motion, shape (M, P, P)."""
     count: int
     """Degrees of freedom (sliding) or number of impacts of the data."""
-    episodes: Array | None = None
-    """Information of each episode of the data, where a test asks that held-out episodes are predicted, (E, P, P)."""
+    episodes: Array
+    """Information of each episode of the data, (E, P, P): tests ask that held-out episodes are predicted."""
 
     def noncentrality(self, information: Array, sizes: Array, variant: int, beside: int | None = None) -> Array:
         """Return the expected fall of chi2 (M,) by a missing effect of given sizes, averaged over its parameters.
@@ -178,9 +178,12 @@ def _sliding(
     soft = soft_world(world)
     known = nuisance_parameters(soft, () if started is None else started.flight_parameters)
     size = len(known) + sum(len(variant.parameters) for variant in variants)
-    data, total = np.zeros((size, size)), np.zeros((count, size, size))
+    data, total = np.zeros((1, size, size)), np.zeros((count, size, size))
     if started is not None:
-        data = _eliminated(started.base.segments, soft, known, started.base.values[0], variants).sum(0)
+        seen = started.base.segments
+        episode = np.array([item.episode for item in seen.items])
+        data = np.zeros((1 + int(episode.max()), size, size))
+        np.add.at(data, episode, _eliminated(seen, soft, known, started.base.values[0], variants))
     items = find_sliding_segments(world, made.observations, made.airborne, made.noise)
     if items:
         segments = made.segments("contact", soft, items)
@@ -194,9 +197,10 @@ def _sliding(
         base=len(known),
         columns=tuple(tuple(range(a, b)) for a, b in itertools.pairwise(ends.tolist())),
         prior=np.array([1 / p.prior[1] ** 2 for p in known]),
-        data=data,
+        data=data.sum(0),
         motions=total,
         count=0 if started is None else int(started.segments.dof.sum()),
+        episodes=data,
     )
 
 

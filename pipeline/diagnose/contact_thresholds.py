@@ -110,6 +110,13 @@ class SlidingThresholds:
         "the fourth, true one is silent, too",
     )
     in_impacts_alone: tuple[str, ...] = threshold(("velocity_restitution",), "effects", "what sliding cannot show")
+    as_friction: tuple[str, ...] = threshold(
+        ("adhesion",),
+        "effects",
+        "`score_sure` does not apply to an effect that presses a sliding body as its weight does: friction follows it "
+        "but for how far the soft contact gives way",
+        "experiments in sequence, development: a cube with nothing hidden had 159 and 188, one with adhesion 2,501",
+    )
     flight_tells_m_s2: float = threshold(
         0.3,
         "m/s2",

@@ -33,8 +33,8 @@ from .verdict import Findings
 Array = NDArray[np.float64]
 
 LIMITS = THRESHOLDS.experiment
-SIZES = 10.0
-"""Largest size of an effect for which motions are chosen, in smallest ones."""
+SIZES = 3.0
+"""Largest size of an effect for which motions are chosen, in smallest ones: larger ones show in most motions."""
 WORTH_TELLING = 0.8
 """Share to which the smallest visible size of an effect must fall for the report to name it."""
 MOST_MOTIONS = 3
@@ -66,21 +66,17 @@ class Question:
         """
         seen, apart = (np.zeros((len(self.variants), len(more))) for _ in range(2))
         for channel in self.channels:
-            both = channel.data + channel.motions[chosen].sum(0)
-            extra = np.stack([channel.motions[k] if k >= 0 else np.zeros_like(both) for k in more])
-            information = both + times * extra
-            cases = information[None]
-            if channel.episodes is not None:  # without any one episode, too
-                parts = [np.broadcast_to(one, extra.shape) for one in (*channel.episodes, *channel.motions[chosen])]
-                cases = np.stack([information, *(information - part for part in (*parts, extra))])
-            every = cases.reshape(-1, *cases.shape[2:])
+            information = _each(channel, chosen, more, times)
             for place, name in enumerate(self.names):
-                own = channel.noncentrality(every, self.sizes[place], place).reshape(len(cases), -1).min(0)
-                enough = own / _needed(channel, self.variants[place])
+                own = _shown(channel, information, self.sizes[place], place)
+                full, rest = _needed(channel, self.variants[place])
+                # the others have to show it, too
+                enough = np.minimum(own[0] / full, own[1:].min(0) / rest)
                 left = np.full(len(more), math.inf)
                 for other, rival in enumerate(self.names):
                     if rival != name and self._asked(name, rival):
-                        left = np.minimum(left, channel.noncentrality(information, self.sizes[place], place, other))
+                        lead = channel.noncentrality(information[0], self.sizes[place], place, other)
+                        left = np.minimum(left, lead)
                 better = enough > seen[place]
                 lead = np.minimum(left / _lead(channel), 1e6)
                 seen[place] = np.where(better, enough, seen[place])
@@ -104,7 +100,9 @@ def next_motions(prepared: Prepared, findings: Findings, candidates: Sequence[Ca
     if rivals is None or not _can_be_made(world, prepared):
         return None
     kept, _ = admissible(world, candidates, prepared.has_orientation)
-    acting = [c for c in kept if c.effect.phase == "contact"]
+    # slides follow a pull at the ground by friction
+    unseen = THRESHOLDS.sliding.as_friction
+    acting = [c for c in kept if c.effect.phase == "contact" and c.effect.name not in unseen]
     if not acting:
         return None
     motions = hand_motions(is_round(world.bodies[world.free[0]]))
@@ -175,15 +173,37 @@ def _chance(share: Array) -> Array:
     return (1 + 0.5 * np.log(np.maximum(share, 1e-300)) / math.log(SIZES)).clip(0.0, 1.0)
 
 
-def _needed(channel: Channel, variant: Variant) -> float:
-    """Return the fall of chi2 from which a test names an effect, with the margin of a detection limit."""
-    number = len(variant.parameters)
+def _each(channel: Channel, chosen: Sequence[int], more: Sequence[int], times: int) -> Array:
+    """Return the information (1 + E, M, P, P) of data and motions, first of all, then without each episode (E).
+
+    Arguments are those of `Question.shares`.
+    """
+    both = channel.data + channel.motions[list(chosen)].sum(0)
+    extra = np.stack([channel.motions[k] if k >= 0 else np.zeros_like(both) for k in more])
+    information = both + times * extra
+    parts = [np.broadcast_to(one, extra.shape) for one in (*channel.episodes, *channel.motions[list(chosen)])]
+    return np.stack([information, *(information - part for part in (*parts, extra))])
+
+
+def _shown(channel: Channel, information: Array, sizes: Array, variant: int) -> Array:
+    """Return the falls of chi2 (1 + E, M) by an effect of given sizes."""
+    flat = information.reshape(-1, *information.shape[2:])
+    return channel.noncentrality(flat, sizes, variant).reshape(information.shape[:2])
+
+
+def _needed(channel: Channel, variant: Variant) -> tuple[float, float]:
+    """Return the falls of chi2 from which a test names an effect, of all episodes and without any one of them.
+
+    Both have the margin of a detection limit.
+    """
+    number, limits = len(variant.parameters), THRESHOLDS.sliding
     if channel.name == "impact":
-        score = THRESHOLDS.impact.score
+        scores = (THRESHOLDS.impact.score, THRESHOLDS.impact.score)
     else:
-        flexible = number > THRESHOLDS.sliding.few_parameters
-        score = THRESHOLDS.sliding.score_flexible if flexible else THRESHOLDS.sliding.score
-    return LIMITS.safe**2 * (score + number * math.log(max(channel.count, 2)))
+        flexible = number > limits.few_parameters
+        scores = (limits.score_flexible if flexible else limits.score, limits.score_sure)
+    full, rest = (LIMITS.safe**2 * (one + number * math.log(max(channel.count, 2))) for one in scores)
+    return full, rest
 
 
 def _lead(channel: Channel) -> float:

@@ -161,7 +161,13 @@ class _SlidingProblem(Problem):
 def information_by_segment(
     segments: Segments, parameters: Sequence[Parameter], values: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return information (B, P, P) and score (B, P) of each segment on parameters at values (P,), its state free."""
+    """Return information (B, P, P) and score (B, P) of each segment on parameters, its state free.
+
+    Args:
+        segments: The segments (B), with fitted states.
+        parameters: Parameters of their world (P).
+        values: Values at which they are linearised, of all segments (P,) or of each (B, P).
+    """
     count, size = len(segments.items), len(parameters)
     free = torch.arange(size).expand(count, size)
     found = finite_differences(segments, parameters, values.expand(count, size), free)

@@ -44,6 +44,8 @@ class StartedSliding:
 
     segments: Segments
     """Sliding segments in the world with the soft contact."""
+    separate: SlidingFit
+    """Fit of each segment alone, with a friction of its own."""
     friction: Tensor
     """Median logarithm of the friction over well-determined segments."""
     base: SlidingFit
@@ -69,10 +71,11 @@ class StartedSliding:
             return None
         soft = soft_world(world)
         segments = prepared.segments("contact", soft, items)
-        segments, friction = _started(segments, float(world.contact.friction[0]))
+        separate, friction = _started(segments, float(world.contact.friction[0]))
+        segments = separate.segments
         flight_parameters = _flight_priors(flight, soft, prepared.groups)
         base = _base(segments, (friction, world.contact.friction[0].log().to(friction)), flight_parameters)
-        return StartedSliding(segments, friction, base, flight_parameters)
+        return StartedSliding(segments, separate, friction, base, flight_parameters)
 
 
 def _base(segments: Segments, frictions: Sequence[Tensor], flight_parameters: Sequence[Parameter]) -> SlidingFit:
@@ -85,7 +88,7 @@ def _base(segments: Segments, frictions: Sequence[Tensor], flight_parameters: Se
     return min(tried, key=lambda fit: fit.cost)
 
 
-def _started(segments: Segments, known: float) -> tuple[Segments, Tensor]:
+def _started(segments: Segments, known: float) -> tuple[SlidingFit, Tensor]:
     """Return sliding segments each fitted with its own friction, and the median logarithm of these frictions."""
     count = len(segments.items)
     states = [grounded_states(segments, line_state(segments, frames)) for frames in START_FRAMES]
@@ -99,7 +102,9 @@ def _started(segments: Segments, known: float) -> tuple[Segments, Tensor]:
     good = (certainty > LIMITS.well_known) & (found.chi2[best] < LIMITS.well_fitted * segments.dof)
     own = found.values[best, 0]
     friction = own[good].median() if bool(good.any()) else torch.full_like(own[0], FRICTION.encode(known))
-    return segments.with_state(found.segments.observations.state.at(best)), friction
+    states = found.segments.observations.state.at(best)
+    alone = SlidingFit(segments.with_state(states), found.chi2[best], found.values[best], found.information[best])
+    return alone, friction
 
 
 def fit_sliding(

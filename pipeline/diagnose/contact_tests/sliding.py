@@ -16,8 +16,11 @@ import numpy as np
 import torch
 
 from ...segments.candidates import Candidate, Variant, with_variants
+from ...segments.segments import Segments
+from ...segments.separate_starts import separate_starts
 from ...segments.sliding_descent import ITERATIONS, SlidingFit, information_by_segment
 from ...segments.sliding_fit import StartedSliding, better_starts, fit_sliding, nuisance_parameters
+from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ..evidence import Evidence
 from ..thresholds import THRESHOLDS, SlidingThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
@@ -106,16 +109,19 @@ class SlidingTest(ContactTest):
             carries=self.limits.carries,
             without_best=self.limits.without_best if data.flown else -math.inf,
         )
-        if doubted or parameters > self.limits.many_parameters or (flexible and data.flown):
+        pressed = best.name in self.limits.as_friction
+        if doubted or pressed or parameters > self.limits.many_parameters or (flexible and data.flown):
             return (usual,)
         return usual, replace(usual, score=self.limits.score_sure, share=self.limits.share_sure)
 
 
 def held_out_gains(variant: Variant, fit: SlidingFit, started: StartedSliding) -> tuple[float, ...]:
-    """Return the fall of chi2 of each episode by an effect that is estimated from the slides of the others.
+    """Return the gain of each episode by an effect that is estimated from the slides of the others.
 
     The nuisance parameters are estimated from the others, too. Without the effect they are those of all episodes, so
-    that the fall is, if anything, too small.
+    that the gain is, if anything, too small. It is twice that of the logarithm of a likelihood of Student's t: the fall
+    of chi2 where chi2 is near its degrees of freedom; where a model is wrong by many times the noise, by how many is
+    no evidence, or one episode would outweigh all others.
 
     Args:
         variant: The effect at its constants.
@@ -128,12 +134,13 @@ def held_out_gains(variant: Variant, fit: SlidingFit, started: StartedSliding) -
     information, score = information_by_segment(segments, [*known, *own], fit.values[0])
     prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in (*known, *own)]).to(information))
     episode = torch.tensor([item.episode for item in segments.items])
-    gains = []
+    degrees, gains = segments.dof, []
     for one in episode.unique():
         mine = episode == one
         step = torch.linalg.solve(information[~mine].sum(0) + prior, score[~mine].sum(0))
         predicted = step @ information[mine].sum(0) @ step - 2 * score[mine].sum(0) @ step
-        gains.append(float((started.base.chi2 - fit.chi2)[mine].sum() - predicted))
+        count, before, after = (float(one[mine].sum()) for one in (degrees, started.base.chi2, fit.chi2))
+        gains.append(2 * count * math.log((before + count) / (max(after + float(predicted), 0.0) + count)))
     return tuple(gains)
 
 
@@ -148,10 +155,9 @@ def _fits(
         thresholds: The smallest score of interest, and which fits are far behind.
     """
     soft_world, base, known = started.segments.world, started.base, started.flight_parameters
-    start = (base.segments, base.values[0])
     found: dict[int, tuple[Variant, SlidingFit]] = {}
     for part in batches(variants):
-        tried = fit_sliding(soft_world, part, [start] * len(part), known, FIRST_ITERATIONS)
+        tried = fit_sliding(soft_world, part, _starts(part, started), known, FIRST_ITERATIONS)
         found |= {len(found) + k: one for k, one in enumerate(zip(part, tried, strict=True))}
     found = _continued(found, started, FIRST_ITERATIONS)
     gains = {k: base.cost - fit.cost for k, (_, fit) in found.items()}
@@ -163,6 +169,16 @@ def _fits(
         fell = [k for k in close if close[k][1].cost - again[k][1].cost > thresholds.converged]
         close = {k: again[k] for k in fell if len(again[k][0].parameters) <= MANY}
     return list(found.values())
+
+
+def _starts(part: Sequence[Variant], started: StartedSliding) -> list[tuple[Segments, torch.Tensor]]:
+    """Return where the fits of variants start: at the fit without them, or nearer where that one stalled."""
+    base = started.base
+    known = [(base.segments, base.values[0])] * len(part)
+    if base.cost < SEGMENT_THRESHOLDS.sliding_data.well_fitted * float(started.segments.dof.sum()):
+        return known
+    separate = separate_starts(started, part)
+    return [one[:2] if one[2] < base.cost else other for one, other in zip(separate, known, strict=True)]
 
 
 def _continued(
