@@ -314,13 +314,18 @@ def _simplest_within(
         and "drag" not in best.candidate.effect.needs
         and _contains(linear, candidates, variants, other, best)
     ]
-    near = [one for one in within if _bic(one) - _bic(within[0]) < LIMITS.alias_chi2 and one.name not in names]
+    near = [one for one in within if _told(one) - _told(within[0]) < LIMITS.alias_chi2 and one.name not in names]
     return sorted([*equals, *near], key=_complexity) if near else list(equals)
 
 
 def _bic(one: Evidence) -> float:
     """Return the change of BIC; infinite where it is unknown."""
     return math.inf if one.delta_bic is None else one.delta_bic
+
+
+def _told(one: Evidence) -> float:
+    """Return the change of BIC by the data alone: an implausible size is a reason to come last, not to be another."""
+    return _bic(one) - one.odds
 
 
 def _complexity(one: Evidence) -> tuple[bool, int, float, str]:

@@ -29,6 +29,8 @@ from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.segments
 
+FORCE = "constant_force"
+"""Name of the effect that a tilt or another gravity is a part of."""
 SCALE = "length_scale"
 """Name of the effect of which each session may have a value of its own."""
 
@@ -66,7 +68,7 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
         after_flight: The world with the effects selected in flight.
         steps: Selection steps of the flight search.
     """
-    flagged = [step for step in steps if step.flagged]
+    flagged, after_flight = _undoubled([step for step in steps if step.flagged], after_flight)
     ambiguous = [step for step in flagged if _is_asked(step, flagged)]
     neutral = after_flight
     for step in ambiguous:
@@ -82,7 +84,7 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
         if step in ambiguous:
             kept, _ = separated(equals, contact, base.world, prepared.groups)
             kept = _with_scales_of_sessions(kept, equals, prepared.groups)
-            equals = _with_aliases(kept, equals)
+            equals = _without_doubles(_with_aliases(kept, equals), [one for one in flagged if one is not step])
             final = _replaced(final, step.best, equals[0])
         chosen.append(tuple(equals))
     final = replace(final, contact=base.world.contact)
@@ -114,6 +116,26 @@ def _with_scales_of_sessions(
     """
     own = [one for one in equals if one.name == SCALE and one not in kept]
     return [*kept, *own] if len(set(groups)) > 1 else list(kept)
+
+
+def _undoubled(steps: Sequence[SelectionStep], world: World) -> tuple[list[SelectionStep], World]:
+    """Return selected steps in which no constant force stands for what another one is a part of, and their world."""
+    found = []
+    for step in steps:
+        others = [one for one in steps if one is not step and one.own_std is None]
+        equals = tuple(_without_doubles(step.equals, others)) if step.own_std is None else step.equals
+        world = _replaced(world, step.best, equals[0])
+        found.append(replace(step, equals=equals))
+    return found, world
+
+
+def _without_doubles(equals: Sequence[Evidence], others: Sequence[SelectionStep]) -> list[Evidence]:
+    """Return equals with a constant force last, where another effect is a part of it.
+
+    A constant force beside a tilt is two names of one horizontal force, and no numbers belong to either alone.
+    """
+    doubled = any(one.name == FORCE for other in others for one in other.equals)
+    return sorted(equals, key=lambda one: one.name == FORCE) if doubled else list(equals)
 
 
 def fitted_contact(prepared: Prepared, world: World) -> tuple[Refit, Segments] | None:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from cgwm.pipeline.diagnose import flight_findings
 from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
+from cgwm.pipeline.diagnose.effect_selection import SelectionStep
 from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.flight_equals import _with_scales_of_sessions
+from cgwm.pipeline.diagnose.flight_equals import _undoubled, _with_scales_of_sessions
 from cgwm.pipeline.diagnose.flight_findings import _Search
 from cgwm.pipeline.diagnose.group_values import _Scored, _unlike
 from cgwm.pipeline.diagnose.robust_fit import robust_repetition
@@ -142,3 +143,14 @@ def test_flights_are_searched_again_where_their_own_accelerations_come_or_go(
     chosen: Any = SimpleNamespace(world=None, names=["linear_drag"])
     found = search(None, None, ()).settled(errors, errors, chosen)
     assert (found[3] is told) == searched
+
+
+def test_a_constant_force_is_no_second_name_of_a_tilt() -> None:
+    tilt, force, scale = (evidence(name) for name in ("gravity_tilt", "constant_force", "length_scale"))
+    across, along = SelectionStep((), (tilt, force), True), SelectionStep((), (force, scale), True)
+    world: Any = SimpleNamespace()
+    found, same = _undoubled([across, along], world)
+    assert [one.best.name for one in found] == ["gravity_tilt", "length_scale"]
+    assert same is world  # neither was refitted
+    assert [one.name for one in found[1].equals] == ["length_scale", "constant_force"]
+    assert _undoubled([along], world)[0][0].best.name == "constant_force"  # alone it may be both
