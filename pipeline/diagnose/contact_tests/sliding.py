@@ -95,6 +95,8 @@ class SlidingTest(ContactTest):
         best = equals[0]
         if best.name in self.limits.higher_at_rest and (best.test.estimate < 0).any():
             return ()
+        if data.sliding is not None and not _unexplained(data.sliding, self.limits.surplus_sigmas):
+            return ()
         parameters = len(best.candidate.effect.parameters)
         flexible = parameters > self.limits.few_parameters
         mapped = any(len(one.candidate.effect.parameters) > self.limits.many_parameters for one in equals)
@@ -113,6 +115,16 @@ class SlidingTest(ContactTest):
         if doubted or pressed or parameters > self.limits.many_parameters or (flexible and data.flown):
             return (usual,)
         return usual, replace(usual, score=self.limits.score_sure, share=self.limits.share_sure)
+
+
+def _unexplained(started: StartedSliding, sigmas: float) -> bool:
+    """Return whether the model alone leaves more than noise in sliding segments.
+
+    Where it does not, a fall of chi2 far below its expectation is no effect: errors of smoothed tracks are smaller
+    between frames, and slower, than their noise model says.
+    """
+    degrees = float(started.segments.dof.sum())
+    return started.base.cost - degrees > sigmas * math.sqrt(2 * degrees)
 
 
 def held_out_gains(variant: Variant, fit: SlidingFit, started: StartedSliding) -> tuple[float, ...]:

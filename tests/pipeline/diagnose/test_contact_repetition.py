@@ -75,7 +75,7 @@ def evidence(name: str, values: tuple[float, ...] = (1.0,)) -> Evidence:
 
 @pytest.mark.parametrize(("rise", "count"), [(0.2, 2), (-0.2, 0)])
 def test_friction_that_is_lower_at_rest_is_the_smeared_end_of_a_slip(rise: float, count: int) -> None:
-    data: Any = SimpleNamespace(flown=False, explained=True)
+    data: Any = SimpleNamespace(flown=False, explained=True, sliding=None)
     assert len(SlidingTest().bars([evidence("stribeck_friction", (rise,))], data)) == count
 
 
@@ -154,3 +154,11 @@ def test_a_constant_force_is_no_second_name_of_a_tilt() -> None:
     assert same is world  # neither was refitted
     assert [one.name for one in found[1].equals] == ["length_scale", "constant_force"]
     assert _undoubled([along], world)[0][0].best.name == "constant_force"  # alone it may be both
+
+
+@pytest.mark.parametrize(("cost", "named"), [(1000.0, False), (1100.0, False), (1400.0, True)])
+def test_slides_that_the_model_explains_down_to_the_noise_name_nothing(cost: float, named: bool) -> None:
+    """A thousand degrees of freedom scatter by 45: what falls below them is a noise that was taken for too large."""
+    sliding = SimpleNamespace(base=SimpleNamespace(cost=cost), segments=SimpleNamespace(dof=np.array([400.0, 600.0])))
+    data: Any = SimpleNamespace(flown=False, explained=True, sliding=sliding)
+    assert bool(SlidingTest().bars([evidence("viscous_friction")], data)) == named
