@@ -42,7 +42,7 @@ LOOKS: tuple[tuple[str, str, float, float, float], ...] = (
 )
 """Background, motion, focal length [px], radial distortion and gloss."""
 PHOTOS = 48
-RIVALS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+RIVALS = ("SIMPLE_RADIAL", "SIMPLE_PINHOLE", "RADIAL", "OPENCV")
 RIGHT_CENTRE_PERCENT, RIGHT_ROTATION_DEG = 0.3, 1.0
 
 
@@ -97,6 +97,8 @@ def ours(photos: Path, truth: np.ndarray) -> dict[str, Any]:
         more = {"model": taken.camera_model, "attempts": len(report.attempts), "warnings": list(report.warnings)}
         stds = [one.center_std_percent for one in report.images.values() if one.center_std_percent is not None]
         more["centre_std_percent"] = max(stds)
+        turns = [one.rotation_std_deg for one in report.images.values() if one.rotation_std_deg is not None]
+        more["rotation_std_deg"] = max(turns)
         estimated = {name: np.array(image.T_world_cam) for name, image in cameras.images.items()}
         estimated = {
             name: pose if len(pose) == 4 else np.vstack([pose, [0, 0, 0, 1]]) for name, pose in estimated.items()
@@ -136,7 +138,7 @@ def right(row: dict[str, Any]) -> bool:
 
 
 def _said(row: dict[str, Any]) -> bool:
-    return any("optical centres" in warning for warning in row["warnings"])
+    return any("optical centres of" in one or "rotations of" in one for one in row["warnings"])
 
 
 def photos_of(ycb: Path, folder: Path, name: str, session: Session) -> tuple[Path, np.ndarray]:
@@ -178,11 +180,7 @@ def main() -> int:
         for name in names
         for session in sessions(seed)
     }
-    wanted = {}
-    for seed in seeds:  # what makes the photos comes first
-        for one in arguments.contenders.split(","):
-            wanted |= {f"{key} {one}": (*value, one) for key, value in sets.items() if key.endswith(f" {seed}")}
-    store.fill(measured, wanted, arguments.workers)
+    store.fill(measured, _in_order(sets, arguments.contenders.split(",")), arguments.workers)
     rows = [
         (mine, [row for one in RIVALS if (row := store.known(f"{key} {one}")) is not None])
         for key in sets
@@ -190,6 +188,17 @@ def main() -> int:
     ]
     print_counts(rows)
     return 0
+
+
+def _in_order(sets: dict[str, Any], contenders: list[str]) -> dict[str, Any]:
+    """Return the arguments of each result: sets in an order drawn once for all, one contender after the other.
+
+    COLMAP takes a table that stands for what turns, and ten times as long as elsewhere: these results come last.
+    """
+    keys = [list(sets)[k] for k in np.random.default_rng(0).permutation(len(sets))]
+    pairs = [(key, one) for one in contenders for key in keys]
+    pairs.sort(key=lambda pair: pair[1] != "cgwm" and "clutter turntable" in pair[0])
+    return {f"{key} {one}": (*sets[key], one) for key, one in pairs}
 
 
 def print_counts(rows: list[tuple[dict[str, Any], list[dict[str, Any]]]]) -> None:
@@ -200,7 +209,7 @@ def print_counts(rows: list[tuple[dict[str, Any], list[dict[str, Any]]]]) -> Non
     print(f"of these cgwm {sum(map(right, solved))}")
     wrong = [row for row in mine if not right(row) and row["registered"] > 0]
     silent = [row for row in wrong if row["registered"] == PHOTOS and not _said(row)]
-    print(f"written but not right: {len(wrong)}, of these complete and without a warning of its centres: {len(silent)}")
+    print(f"written but not right: {len(wrong)}, of these complete and without a warning: {len(silent)}")
     print(f"right with such a warning: {sum(right(row) and _said(row) for row in mine)}")
 
 

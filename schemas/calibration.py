@@ -25,6 +25,8 @@ class ImageVerdict(FileModel):
     center_std_percent: float | None = None
     """Standard deviation of the optical centre [% of the diagonal of the box around all centres], at most 100; none for
     an image that is not registered."""
+    rotation_std_deg: float | None = None
+    """Standard deviation of the camera's rotation [deg]; none for an image that is not registered."""
 
 
 class PairFigures(FileModel):

@@ -6,18 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from ...datasets.capture.images import read_rgb
 from ...schemas import CalibrateConfig, NotConvergedError
 from ...schemas.calibration import CalibrationAttempt, ImageVerdict, PairFigures, SelfCheckFigures
 from . import colmap
 from .camera_models import FIRST_TRIED, LADDER, richer, supported
-from .center_uncertainty import focal_stds
+from .center_uncertainty import center_stds, focal_stds
 from .consistency_check import SelfCheck, check_model
 from .focal_prior import EXIF_STD, FocalLength, focal_lengths
-from .mapping import Mapped, adjusted, map_database, with_focal_lengths, without_outliers
+from .mapping import Mapped, adjusted, map_database, triangulated, with_focal_lengths, without_outliers
 from .photos import Inputs
 from .reconstruction import SfmModel, VerifiedPair
+from .track_alignment import aligned
 from .turntable_cameras import TurntableCameras, on_turntable
 from .turntable_motion import TurntableMotion
 
@@ -30,6 +34,11 @@ _THOROUGH_TRIALS = 10000  # COLMAP's default: finds pairs with few true matches
 _TIGHT_RATIO = 0.7  # Lowe's test for repeated texture
 _RICHEST_ON_TURNTABLE = "RADIAL"
 """Tangential distortion can hardly be told from a rotation of the camera where the camera always stands alike."""
+
+
+_CERTAIN_CENTER = 0.005
+"""Standard deviation of optical centres, as a fraction of their extent, up to which features are fine enough: that at
+which a warning would be given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,14 +189,47 @@ def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[Mapped], st
             break
     if not best:
         return [], ""
+    largest, taken = _supported(best[0], start, inputs, seed)
+    if _uncertain(largest, taken, inputs):
+        largest, taken = _aligned(best[0], start, database, inputs, seed)
+    return [largest, *best[1:]], taken
+
+
+def _supported(mapped: Mapped, start: str, inputs: Inputs, seed: int) -> tuple[Mapped, str]:
+    """Return a model without outliers, with cameras as rich as its observations support, and how rich they are."""
     steps = [
-        (model, adjusted(best[0], limited(model, inputs), inputs.known, seed))
+        (model, adjusted(mapped, limited(model, inputs), inputs.known, seed))
         for model in richer(start, "SIMPLE_PINHOLE" if _all_known(inputs) else "OPENCV")
     ]
-    free = len(set(best[0].names.values()) - set(inputs.known))
+    free = len(set(mapped.names.values()) - set(inputs.known))
     taken = supported([(model, step.residuals_px()) for model, step in steps], free)
-    largest = without_outliers(dict(steps)[taken], inputs.known, seed)
-    return [largest, *best[1:]], taken
+    return without_outliers(dict(steps)[taken], inputs.known, seed), taken
+
+
+def _uncertain(mapped: Mapped, camera_model: str, inputs: Inputs) -> bool:
+    """Return whether the centres are so uncertain that finer places of the points are worth their time."""
+    model = mapped.model()
+    return max(center_stds(model, estimated(camera_model, model, inputs)).values()) > _CERTAIN_CENTER
+
+
+def _aligned(mapped: Mapped, start: str, database: Path, inputs: Inputs, seed: int) -> tuple[Mapped, str]:
+    """Return what `_supported` does, of points whose places in the photos are aligned to each other.
+
+    With the cameras of the first round the points of all matches are found anew, and looked for in further photos.
+    """
+    photos = {name: _brightness(inputs.root / name) for name in mapped.model().T_cam_world}
+    taken = start
+    for further in (False, True):
+        if further:
+            mapped = triangulated(mapped, database, inputs.root, seed)
+        mapped = adjusted(mapped, limited(start, inputs), inputs.known, seed)
+        mapped = mapped.with_observations(aligned(mapped.model(), photos, further))
+        mapped, taken = _supported(mapped, start, inputs, seed)
+    return mapped, taken
+
+
+def _brightness(photo: Path) -> NDArray[np.float32]:
+    return cv2.cvtColor(read_rgb(photo), cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
 def _with_exif(

@@ -1,4 +1,4 @@
-"""How far camera centres and focal lengths of a model may be off, from the normal equations of its bundle adjustment.
+"""How far centres, rotations and focal lengths of a model may be off: from the normal equations of its adjustment.
 
 The covariance of least squares counts the errors of all matches as independent. They are not: a feature's place shifts
 with the direction from which it is seen, by hundredths of a pixel, and all features of a surface shift alike. Through
@@ -24,6 +24,10 @@ from .turntable_motion import TurntableMotion
 SHARED_ERROR_PX = 0.015
 """Error that observations share [px], as root mean square: calibrated on photos of one scanned object with known
 cameras, judged on those of others ([Thresholds](../../docs/thresholds.md))."""
+
+PRINCIPAL_STD = 0.003
+"""Standard deviation of a coordinate of the principal point about the middle, as a fraction of the picture's diagonal:
+a lens is centred on a sensor to some tenths of a millimetre. Matches on one object hardly tell it from a rotation."""
 
 _FLOOR = 1e-9
 """Least information of a number that scales it, relative to the largest."""
@@ -56,6 +60,29 @@ def center_stds(
     extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
     sums = variances[: POSE * len(centers)].reshape(-1, POSE)[:, :3].sum(1) / extent**2
     return {image: _root(value) for image, value in zip(model.T_cam_world, sums, strict=True)}
+
+
+def rotation_stds(
+    model: SfmModel, models: Map[str, str], with_exif: Collection[str] = (), motion: TurntableMotion | None = None
+) -> dict[str, float]:
+    """Return the standard deviation of each camera's rotation [rad], after the alignment of `center_stds`.
+
+    A principal point that is not in the middle of the picture, where estimated cameras have it, counts as a rotation.
+
+    Args:
+        model: As in `center_stds`.
+        models: As there.
+        with_exif: As there.
+        motion: As there.
+    """
+    variances, _ = _variances(model, models, with_exif, motion)
+    turns = variances[: POSE * len(model.T_cam_world)].reshape(-1, POSE)[:, 3:].sum(1)
+    stds = {}
+    for image, variance in zip(model.T_cam_world, turns, strict=True):
+        camera = model.camera(image)
+        shift = PRINCIPAL_STD * np.hypot(camera.width, camera.height) if model.image_camera[image] in models else 0.0
+        stds[image] = float(np.hypot(_root(variance), np.sqrt(2.0) * shift / camera.focal_px))
+    return stds
 
 
 def focal_stds(model: SfmModel, models: Map[str, str]) -> dict[str, float]:

@@ -22,7 +22,7 @@ from .reconstruction import Array, SfmCamera, SfmModel
 _MIN_MODEL_IMAGES = 3
 LOSS_SCALE = 2.0
 """Scale of the Cauchy loss, in standard deviations of a coordinate of the residuals."""
-_LEAST_NOISE_PX = 0.1
+_LEAST_NOISE_PX = 0.05
 """Lower bound of that standard deviation [px]; without one, exact observations would have no scale."""
 _KEEP_WITHIN = (4.0, 3.0)
 """Residuals above this many standard deviations are taken for wrong matches, in turn, each after an adjustment."""
@@ -47,6 +47,27 @@ class Mapped:
     def model(self) -> SfmModel:
         """Return the model as plain arrays."""
         return _plain_model(self.reconstruction, self.names)
+
+    def with_observations(self, model: SfmModel) -> Mapped:
+        """Return the model with the observations of `model`, which is as `model()` returned it in all else."""
+        new = pycolmap.Reconstruction()
+        for camera in self.reconstruction.cameras.values():
+            new.add_camera_with_trivial_rig(camera)
+        tracks = [pycolmap.Track() for _ in model.points]
+        for image in sorted(self.reconstruction.images.values(), key=lambda one: one.image_id):
+            if image.has_pose:
+                pixels, seen = model.observations[image.name]
+                points = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels])
+                copy = pycolmap.Image(
+                    name=image.name, camera_id=image.camera_id, image_id=image.image_id, points2D=points
+                )
+                new.add_image_with_trivial_frame(copy, image.cam_from_world())
+                for index, point in enumerate(seen):
+                    tracks[point].add_element(image.image_id, index)
+        for position, color, track in zip(model.points, model.colors, tracks, strict=True):
+            if track.length() > 1:
+                new.add_point3D(position, track, color)
+        return Mapped(reconstruction=new, names=self.names)
 
     def residuals_px(self) -> Array:
         """Return the lengths of the reprojection errors of all observations [px], shape (observation,)."""
@@ -128,6 +149,38 @@ def without_outliers(mapped: Mapped, known: Map[str, CameraIntrinsics], seed: in
         _drop_outliers(copy, limit)
         _adjust(copy, _fixed(mapped, known), seed)
     return Mapped(reconstruction=copy, names=mapped.names)
+
+
+def triangulated(mapped: Mapped, database: Path, root: Path, seed: int) -> Mapped:
+    """Return a model with the points of all matches of a database that agree with its cameras, which stay.
+
+    Args:
+        mapped: The model.
+        database: The database of `colmap.build_database`; its cameras become those of the model.
+        root: Folder of the images.
+        seed: Seed of COLMAP.
+    """
+    opened = pycolmap.Database.open(database)
+    try:
+        for camera in mapped.reconstruction.cameras.values():
+            opened.update_camera(camera)
+    finally:
+        opened.close()
+    output = database.with_suffix(".points")
+    output.mkdir(exist_ok=True)
+    found = run(
+        lambda cancellation_token: pycolmap.triangulate_points(
+            pycolmap.Reconstruction(mapped.reconstruction),
+            database,
+            root,
+            output,
+            clear_points=True,
+            refine_intrinsics=False,
+            options=_options(seed),
+        ),
+        seed,
+    )
+    return Mapped(reconstruction=found, names=mapped.names)
 
 
 def noise_px(residuals_px: Array) -> float:

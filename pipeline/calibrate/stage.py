@@ -38,13 +38,14 @@ from ...schemas.calibration import CalibrationAttempt, CalibrationReport, FocalF
 from ..runtime.work_budget import Part, within_budget
 from . import colmap
 from .attempts import MIN_PHOTOS, Candidate, check_figures, estimated, photo_count, photo_labels, search, verdict
-from .center_uncertainty import center_stds
+from .center_uncertainty import center_stds, rotation_stds
 from .depth_scale import from_depth
 from .given_intrinsics import read_intrinsics
 from .markers import detect_markers, dictionary
 from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
 from .photos import Inputs, gather, video_label
 from .reconstruction import Array, SfmCamera, SfmModel, Similarity, world_from_cam
+from .turntable_motion import TurntableMotion
 from .world_frame import dominant_plane, ground_frame
 
 CAMERAS_NAME = "cameras.json"
@@ -55,6 +56,8 @@ _FEATURE_BYTES = 76
 """Lower bound of a feature in the database [bytes]: half of its descriptor and place."""
 UNCERTAIN_CENTER = 0.005
 """Standard deviation of an optical centre, as a fraction of the extent of all, above which a warning is given."""
+UNCERTAIN_ROTATION_DEG = 0.5
+"""Standard deviation of a camera's rotation [deg] above which a warning is given: beyond a degree one time in 20."""
 _MANY_WITHOUT_STRONG = 0.5
 """Share of registered images without a pair of many verified matches above which a warning is given."""
 
@@ -269,9 +272,11 @@ def _report(
     scale: Scale,
     world_frame: str,
 ) -> CalibrationReport:
-    stds = _center_stds_percent(best, inputs)
+    stds, turns = _center_stds_percent(best, inputs), _rotation_stds_deg(best, inputs)
     verdicts = {
-        source.label: verdict(source.label, best).model_copy(update={"center_std_percent": stds.get(source.label)})
+        source.label: verdict(source.label, best).model_copy(
+            update={"center_std_percent": stds.get(source.label), "rotation_std_deg": turns.get(source.label)}
+        )
         for source in inputs.sources
     }
     photos = photo_labels(inputs)
@@ -296,7 +301,13 @@ def _report(
         ground_height_m=height,
         turntable_rings=_rings(best),
         focal_lengths=_focal_figures(best),
-        warnings=(*inputs.notes, *_warnings(best), *_wrong_exif(best), *_uncertain_centers(stds)),
+        warnings=(
+            *inputs.notes,
+            *_warnings(best),
+            *_wrong_exif(best),
+            *_uncertain_centers(stds),
+            *_uncertain_rotations(turns),
+        ),
         config=config,
         versions=colmap.versions(),
         wall_time_s=0.0,
@@ -305,12 +316,21 @@ def _report(
 
 def _center_stds_percent(best: Candidate, inputs: Inputs) -> dict[str, float]:
     """Return the standard deviation of each optical centre [% of their extent], at most 100."""
-    models = estimated(best.camera_model, best.model, inputs)
-    with_exif = [camera for camera, focal in best.focals.items() if focal.agree]
+    return {image: round(min(100.0 * std, 100.0), 4) for image, std in center_stds(*_estimated(best, inputs)).items()}
+
+
+def _rotation_stds_deg(best: Candidate, inputs: Inputs) -> dict[str, float]:
+    """Return the standard deviation of each camera's rotation [deg], at most 180."""
     return {
-        image: round(min(100.0 * std, 100.0), 4)
-        for image, std in center_stds(best.model, models, with_exif, best.motion).items()
+        image: round(min(float(np.degrees(std)), 180.0), 3)
+        for image, std in rotation_stds(*_estimated(best, inputs)).items()
     }
+
+
+def _estimated(best: Candidate, inputs: Inputs) -> tuple[SfmModel, dict[str, str], list[str], TurntableMotion | None]:
+    """Return the model, the camera models of estimated intrinsics, the cameras whose EXIF data count, the turntable."""
+    with_exif = [camera for camera, focal in best.focals.items() if focal.agree]
+    return best.model, estimated(best.camera_model, best.model, inputs), with_exif, best.motion
 
 
 def _rings(best: Candidate) -> tuple[int, ...]:
@@ -350,6 +370,19 @@ def _uncertain_centers(stds_percent: dict[str, float]) -> list[str]:
         f"{100.0 * UNCERTAIN_CENTER:g} % of their extent ({worst}: {stds_percent[worst]:.1f} %): few matches tie them "
         "to the others, or the lens is long; more photos between them, surroundings with texture or known intrinsics "
         "([[calibration.intrinsics]]) make them certain"
+    ]
+
+
+def _uncertain_rotations(stds_deg: dict[str, float]) -> list[str]:
+    uncertain = [image for image, std in stds_deg.items() if std > UNCERTAIN_ROTATION_DEG]
+    if not uncertain:
+        return []
+    worst = max(uncertain, key=lambda image: stds_deg[image])
+    return [
+        f"the rotations of {len(uncertain)} of {len(stds_deg)} registered images are less certain than "
+        f"{UNCERTAIN_ROTATION_DEG:g} deg ({worst}: {stds_deg[worst]:.1f} deg), part of it since the principal point is "
+        "taken to be in the middle: known intrinsics ([[calibration.intrinsics]]) and more texture around the object "
+        "make them certain"
     ]
 
 

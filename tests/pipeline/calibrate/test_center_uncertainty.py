@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cgwm.pipeline.calibrate import center_uncertainty
-from cgwm.pipeline.calibrate.center_uncertainty import center_stds
+from cgwm.pipeline.calibrate.center_uncertainty import center_stds, rotation_stds
 from cgwm.pipeline.calibrate.metric_scale import umeyama
 from cgwm.pipeline.calibrate.reconstruction import SfmModel, Similarity
 from helpers.sfm_scene import make_scene, rotation_about
@@ -58,17 +58,37 @@ def _adjusted(model: SfmModel) -> SfmModel:
 @pytest.mark.evidence  # 40 bundle adjustments by finite differences
 def test_equals_the_scatter_of_adjustments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(center_uncertainty, "SHARED_ERROR_PX", 0.0)
+    monkeypatch.setattr(center_uncertainty, "PRINCIPAL_STD", 0.0)  # the scene's is in the middle
     model = _scene()
     true, extent = model.centers(), np.linalg.norm(np.ptp(model.centers(), axis=0))
-    off, stated = [], []
+    off, stated, turned, stated_turns = [], [], [], []
     for seed in range(40):
         fitted = _adjusted(_noisy(model, seed))
-        off.append(umeyama(fitted.centers(), true).points(fitted.centers()) - true)
+        similarity = umeyama(fitted.centers(), true)
+        off.append(similarity.points(fitted.centers()) - true)
         stated.append(list(center_stds(fitted, MODELS).values()))
+        turns = [
+            similarity.pose(pose)[:3, :3] @ model.T_cam_world[name][:3, :3].T
+            for name, pose in fitted.T_cam_world.items()
+        ]
+        turned.append(Rotation.from_matrix(np.array(turns)).as_rotvec())
+        stated_turns.append(list(rotation_stds(fitted, MODELS).values()))
     scatter = np.sqrt((np.array(off) ** 2).sum(2).mean(0)) / extent
     # 40 draws: the standard error of a root mean square of three directions is about 7 %
     assert np.median(stated, 0) == pytest.approx(scatter, rel=0.3)
     assert np.sqrt((np.median(stated, 0) ** 2).mean()) == pytest.approx(np.sqrt((scatter**2).mean()), rel=0.1)
+    scatter = np.sqrt((np.array(turned) ** 2).sum(2).mean(0))
+    assert np.median(stated_turns, 0) == pytest.approx(scatter, rel=0.3)
+
+
+def test_a_principal_point_off_the_middle_is_a_rotation(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = _scene(points=300)
+    stds, known = (np.array(list(rotation_stds(model, models).values())) for models in (MODELS, {}))
+    monkeypatch.setattr(center_uncertainty, "PRINCIPAL_STD", 0.0)
+    without, same = (np.array(list(rotation_stds(model, models).values())) for models in (MODELS, {}))
+    camera = model.cameras["photos"]
+    angle = np.sqrt(2) * 0.003 * np.hypot(camera.width, camera.height) / camera.focal_px
+    assert stds**2 - without**2 == pytest.approx(angle**2) and list(known) == list(same)
 
 
 def test_is_proportional_to_the_noise_and_free_of_place_and_unit(monkeypatch: pytest.MonkeyPatch) -> None:
