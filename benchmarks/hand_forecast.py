@@ -40,10 +40,10 @@ INTERVAL_S, AHEAD, EVERY = 0.05, 10, 3
 CHECKED = (2, 5, 10)
 """Commands after the start at which predictions are compared."""
 COMPARED = (
-    (0.002, 16, 0.02), (0.0005, 16, 0.02), (0.0005, 16, 0.01), (0.0005, 16, 0.005), (0.0005, 48, 0.005),
-    (0.0005, 16, 0.002),
+    (0.002, 24, 0.01), (0.0003, 12, 0.01), (0.0003, 24, 0.02), (0.0003, 24, 0.01), (0.0003, 24, 0.005),
+    (0.0003, 24, 0.002),
 )  # fmt: skip
-"""Radius by which corners are rounded [m], corners of a link, and step [s] of the predictions compared."""
+"""Radius by which corners are rounded [m], corners of a part, and step [s] of the predictions compared."""
 COLUMNS = {
     "position_m": "position_m", "quat_wxyz": "quat_wxyz", "velocity_m_s": "velocity_m_s",
     "omega_body_rad_s": "omega_body_rad_s", "joints": "joints_rad", "speeds": "speeds_rad_s",
@@ -74,7 +74,7 @@ def task_of(folder: str, scene: Path, corners: int, step_s: float, seconds: floa
 def moments_of(scene: Path, seed: int, seconds: float) -> Iterator[Moment]:
     """Yield the starts of one run of the controller."""
     with tempfile.TemporaryDirectory() as folder:
-        controller = HandController(hand.cube(), task_of(folder, scene, 16, 0.005, seconds))
+        controller = HandController(hand.cube(), task_of(folder, scene, 24, 0.01, seconds))
         found = run_hand(controller, HandScenePlant(controller.hand), seed, "ideal")
         columns = {name: found.column(name) for name in COLUMNS}
         targets, names = found.column("target"), controller.joints
@@ -174,7 +174,7 @@ def main() -> None:
     moments = [found for seed in given.seeds.split(",") for found in moments_of(scene, int(seed), given.seconds)]
     print(f"{len(moments)} states\n\n| | 0.1 s | 0.25 s | 0.5 s | a step, CPU |\n| --- | --- | --- | --- | --- |")
     print(f"| {' | '.join(row('still', moments, lambda: still(moments), None))} |")
-    predicted(moments[:1], scene, 16, 0.005)  # compiles
+    predicted(moments[:1], scene, 24, 0.005)  # compiles
     usual = link_hulls.ROUNDING_M
     for rounding, corners, step_s in COMPARED:
         link_hulls.ROUNDING_M = rounding

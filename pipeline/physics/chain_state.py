@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
+from weakref import ref
 
 import torch
 from torch import Tensor
@@ -224,7 +225,7 @@ def _posed(
         field[:, rows] = values_
     found = type(state)(*fields)
     if chain.moving and _principal(chain, value):
-        _MADE[found.position_m] = _Made(chain, [(id(part), part._version) for part in found.tensors], value, speed)
+        _MADE[found.position_m] = _Made(chain, [(ref(part), part._version) for part in found.tensors], value, speed)
     return found
 
 
@@ -234,8 +235,8 @@ class _Made:
 
     chain: Chain
     """Their chain."""
-    tensors: list[tuple[int, int]]
-    """Number and version of the state's tensors then: one that was changed in place is another state."""
+    tensors: list[tuple[ref[Tensor], int]]
+    """The state's tensors and their versions: one that was changed in place makes another state."""
     value: Tensor
     """Values of the moving joints (B, joints)."""
     speed: Tensor
@@ -243,7 +244,10 @@ class _Made:
 
     def of(self, state: State) -> bool:
         """Return whether a state is the one that was made."""
-        return self.tensors == [(id(part), part._version) for part in state.tensors]
+        return all(
+            own() is part and version == part._version
+            for (own, version), part in zip(self.tensors, state.tensors, strict=True)
+        )
 
 
 _MADE: MutableMapping[Tensor, _Made] = WeakTensorKeyDictionary()
