@@ -1,14 +1,15 @@
 """A LEAP hand turns a cube to random orientations: the controller of cgwm on the scene of judo-rai.
 
-python benchmarks/hand.py run --scene FOLDER [--seeds 5] [--clock ideal|real|cpu] [--contenders mppi,both,hold]
+python benchmarks/hand.py run --scene FOLDER [--first 0] [--seeds 5] [--clock ideal|real|cpu] [--contenders mppi,cem]
 python benchmarks/hand.py table
 
 FOLDER is `judo/models` of the wheel of judo-rai 0.1.0 (MIT; `pip download --no-deps judo-rai==0.1.0`), with the meshes
 of google-deepmind/mujoco_menagerie's leap_hand, of which only `tip` and `thumb_tip` collide. The plant is its scene
 `xml/leap_cube_sim.xml` as it is; the planner's hand is made from the file of the hand alone, which is cut out of that
-scene. A goal counts within 0.4 rad; a run ends at a drop, after 80 s without a goal, or at its length. Clocks: real
-charges each plan its wall time, cpu the time of all processors (what one idle core would need), ideal nothing. `hold`
-never moves: what the goals give by chance.
+scene. A goal counts within 0.4 rad; a run ends at 20 goals, a drop, after 80 s without a goal, or at its length.
+Clocks: real charges each plan its wall time, cpu the time of all processors (what one idle core would need), ideal
+nothing. Contenders: mppi, both, gauss-newton; `hold` never moves: what the goals give by chance; `cem`: see
+`hand_cem.py`, with compute for free.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant
 from cgwm.pipeline.control.solvers import Solution
 from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, Pose, Provenance
+from hand_cem import run_cem
 from processor_clock import charge_processors
 from store import Store
 
@@ -89,7 +91,7 @@ def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
                 "horizon_s": given.horizon,
                 "step_s": given.step,
             },
-            "success": {"turn_deg": math.degrees(0.4), "drop_m": 0.4, "goals": 1000, "timeout_s": given.seconds},
+            "success": {"turn_deg": math.degrees(0.4), "drop_m": 0.4, "goals": 20, "timeout_s": given.seconds},
             "plant": {"kind": "mujoco", "scene": "xml/leap_cube_sim.xml", "body": "cube"},
         }
     )
@@ -107,8 +109,11 @@ class Hold:
 
 def measure(name: str, task: HandTask, seed: int, clock: str, device: str) -> dict[str, Any]:
     """Return the figures of one run."""
-    solver = "mppi" if name == "hold" else name
+    solver = "mppi" if name in ("hold", "cem") else name
     controller = HandController(cube(), task, solver, device=device)  # pyright: ignore[reportArgumentType]
+    if name == "cem":
+        ended, goals, time_s = run_cem(controller, task.folder, seed, task.success.timeout_s)
+        return {"ended": ended, "time_s": round(time_s, 2), "goals": goals}
     if name == "hold":
         controller._solver = Hold()
     if clock == "cpu":
@@ -138,12 +143,13 @@ def rows(store: Store) -> Iterator[list[str]]:
     for row in store.results():
         found.setdefault(row["key"].rpartition("/")[0], []).append(row)
     for name, runs in sorted(found.items()):
+        late, plans = (sum(run.get(key, 0) for run in runs) for key in ("late", "plans"))
         minutes = sum(run["time_s"] for run in runs) / 60
         goals = [run["goals"] for run in runs]
         yield [name, str(len(runs)), f"{sum(goals)} in {minutes:.1f} min", f"{sum(goals) / minutes:.1f}",
                f"{np.median(goals):.0f}", str(sum(run["ended"] == "dropped" for run in runs)),
-               f"{np.median([run['plan_cpu_ms'] for run in runs]):.0f}",
-               f"{100 * sum(run['late'] for run in runs) / sum(run['plans'] for run in runs):.0f}"]  # fmt: skip
+               f"{np.median([run.get('plan_cpu_ms', 0) for run in runs]):.0f}",
+               f"{100 * late / max(plans, 1):.0f}"]  # fmt: skip
 
 
 HEADER = ("contender, clock, rate", "runs", "goals", "goals a minute", "goals a run (median)", "drops", "plan, CPU ms",
@@ -157,12 +163,13 @@ def main() -> None:
     parser.add_argument("--scene", type=Path, help="judo/models of judo-rai 0.1.0, with meshes/leap/")
     parser.add_argument("--contenders", default="mppi")
     parser.add_argument("--clock", choices=("real", "ideal", "cpu"), default="real")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=60.0, help="length of a run")
-    parser.add_argument("--hz", type=float, default=20.0)
-    parser.add_argument("--samples", type=int, default=64)
-    parser.add_argument("--corners", type=int, default=12, help="of a link's shape")
-    parser.add_argument("--horizon", type=float, default=1.0)
+    parser.add_argument("--hz", type=float, default=50.0)
+    parser.add_argument("--samples", type=int, default=32)
+    parser.add_argument("--corners", type=int, default=24, help="of the shape of a part of a link")
+    parser.add_argument("--horizon", type=float, default=0.5)
     parser.add_argument("--step", type=float, default=0.01)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the predictions")
     parser.add_argument("--store", type=Path, default=None)
@@ -179,7 +186,7 @@ def main() -> None:
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     with tempfile.TemporaryDirectory() as folder:
         task = task_in(Path(folder), given.scene, given)
-        for seed in range(given.seeds):
+        for seed in range(given.first, given.first + given.seeds):
             for name in given.contenders.split(","):
                 size = f"{given.samples} x {given.horizon:g} s in steps of {1e3 * given.step:g} ms"
                 key = f"{name}, {given.clock}, {given.hz:g} Hz, {size}, {given.device}/{seed}"
