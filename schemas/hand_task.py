@@ -19,7 +19,6 @@ from .control import (
     Positive,
     Range,
     Rate,
-    Samples,
     Share,
     TaskSection,
     read_task,
@@ -116,14 +115,12 @@ class HandCostsSection(TaskSection):
 class HandPlannerSection(PlannerSection):
     """How plans are made."""
 
-    control_hz: Rate = 10.0
-    """Commands per second [Hz]."""
-    horizon_s: HorizonLength = 1.0
+    control_hz: Rate = 20.0
+    """Commands per second [Hz]; more of them reach more goals, where the machine can hold them."""
+    horizon_s: HorizonLength = 0.5
     """Length of a plan [s]."""
     knots: Knots = 4
     """Pieces of a plan, in which the targets change at constant speed."""
-    samples: Samples = 64
-    """Sequences of commands that are compared for a plan."""
     step_s: Step = 0.01
     """Largest time step of a prediction [s]; contacts are softened to it."""
 
