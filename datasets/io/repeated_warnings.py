@@ -17,6 +17,8 @@ def fold_repeated(messages: Sequence[str]) -> list[str]:
 
     >>> fold_repeated(["episode 'a' begins 2 ms late.", "no cameras.", "episode 'b' begins 3 ms late.", "no cameras."])
     ['2 episodes (a, b) begin 2 to 3 ms late.', 'no cameras.']
+    >>> fold_repeated(["episode 'a' begins 2 ms late.", "episode 'a' begins 3 ms late."])
+    ["episode 'a' begins 2 to 3 ms late."]
     """
     alike: dict[str, list[str]] = {}
     for message in dict.fromkeys(messages):
@@ -27,9 +29,9 @@ def fold_repeated(messages: Sequence[str]) -> list[str]:
 
 
 def _folded(same: Sequence[str]) -> str:
-    """Return messages about different episodes as one, with the range of each number."""
+    """Return messages about episodes as one, with the range of each number; several models may tell of one episode."""
     found = [match for message in same if (match := _SUBJECT.match(message))]
-    names = [match[2] for match in found]
+    names = list(dict.fromkeys(match[2] for match in found))
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     rests = [message[match.end() :] for message, match in zip(same, found, strict=True)]
     columns = iter(list(zip(*(_NUMBER.findall(rest) for rest in rests), strict=True)))
@@ -39,4 +41,6 @@ def _folded(same: Sequence[str]) -> str:
         return least if float(least) == float(most) else f"{least} to {most}"
 
     rest = _NUMBER.sub(spread, rests[0])
+    if len(names) == 1:
+        return found[0][0] + rest
     return f"{len(names)} {found[0][1]}s ({', '.join(names[:SHOWN])}{more}) {_PLURAL[found[0][3]]} {rest}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -95,11 +96,10 @@ def _warned(result: CompareResult, names: Sequence[str]) -> list[str]:
 
 
 def _card(model: ModelComparison, name: str) -> str:
-    rows = [
-        ("mean", f"{fixed(model.translation_error_m.mean, 1, _MM)} mm"),
-        ("rotation, median", "–" if model.rotation_error_deg is None else f"{model.rotation_error_deg.median:.1f} deg"),
-        ("short predictions", "–" if not model.reduced_chi2 else f"{model.reduced_chi2**0.5:.1f} × noise"),
-    ]
+    rows = [("mean", f"{fixed(model.translation_error_m.mean, 1, _MM)} mm")]
+    if model.rotation_error_deg is not None:
+        rows.append(("rotation, median", f"{model.rotation_error_deg.median:.1f} deg"))
+    rows.append(("short predictions", "–" if not model.reduced_chi2 else f"{model.reduced_chi2**0.5:.1f} × noise"))
     if model.psnr_object_db is not None:
         rows.append(("PSNR within the object", f"{model.psnr_object_db.median:.1f} dB"))
     listed = "".join(f"<dt>{label}</dt><dd>{value}</dd>" for label, value in rows)
@@ -289,10 +289,11 @@ def _phases(result: CompareResult, names: Sequence[str]) -> str:
             )
     if not rows:
         return ""
-    noise = result.measurement_std
+    noise = f"{fixed(result.measurement_std['position_m'], 2, _MM)} mm"
+    if any(model.rotation_error_deg is not None for model in result.models):
+        noise += f" and {number(math.degrees(result.measurement_std['rotation_rad']), 2)} deg"
     words = (
-        "Short predictions by phase, in units of the noise "
-        f"({fixed(noise['position_m'], 2, _MM)} mm and {number(noise['rotation_rad'] * 57.29578, 2)} deg per axis). "
+        f"Short predictions by phase, in units of the noise ({noise} per axis). "
         "Reduced χ² is the mean square, corrected for the fitted starts: about 1 where the model explains the data. "
         "Residuals of one impact are correlated, so their χ² is not a test. The last columns are the root mean square "
         "residuals of each degree of freedom; because the starts are fitted, they are below 1 where the model is "

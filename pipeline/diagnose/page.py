@@ -184,9 +184,10 @@ def _missing(result: DiagnoseResult, pictures: Pictures) -> str:
     if missing is None:
         return ""
     axis = f"{missing.coordinate} [{_UNITS[missing.coordinate]}]" if missing.coordinate in _UNITS else "episode"
+    what = "force over mass, and torque over inertia," if missing.torque else "force over mass"
     words = (
-        "The constant force over mass, and torque over inertia, that would have to be added in each short window of "
-        "flight, with one standard error. The line joins the means of four groups of windows. "
+        f"The constant {what} that would have to be added in each short window of flight, with one standard error. The "
+        "line joins the means of four groups of windows. "
         f"{organised('constant' if missing.same_everywhere else missing.coordinate)}"
     )
     pieces = [paragraph(words), _curves(missing, axis, "The model lacks")]

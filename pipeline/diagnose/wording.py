@@ -12,15 +12,15 @@ from .verdict import Findings
 
 _DIFFERS = " Something is left in flight; it differs from episode to episode, as errors of the tracking do."
 _ORGANISED = {
-    "constant": "In these flights, one constant force explains more of it than any coordinate does.",
-    "time": "It changes most clearly with the time within an episode.",
-    "x": "It changes most clearly with the place along x.",
-    "y": "It changes most clearly with the place along y.",
-    "height": "It changes most clearly with the height.",
-    "heading": "It changes most clearly with the direction of motion.",
-    "speed": "It changes most clearly with the speed.",
-    "spin": "It changes most clearly with the spin.",
-    "episode": "It differs most clearly from episode to episode.",
+    "constant": "In these flights, one constant force explains more than any coordinate does.",
+    "time": "The force changes most clearly with the time within an episode.",
+    "x": "The force changes most clearly with the place along x.",
+    "y": "The force changes most clearly with the place along y.",
+    "height": "The force changes most clearly with the height.",
+    "heading": "The force changes most clearly with the direction of motion.",
+    "speed": "The force changes most clearly with the speed.",
+    "spin": "The force changes most clearly with the spin.",
+    "episode": "The force differs most clearly from episode to episode.",
 }
 
 
