@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...schemas import PHASES, Phase
-from ..physics.world import World
+from ..physics.world import State, World
 from ..segments.contact_phases import phases_of
 from ..segments.prepare import Prepared
 from ..segments.segment_states import fit_states
@@ -83,7 +83,37 @@ class ShortFit:
     """The residuals by episode."""
 
 
-def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, bodies: Sequence[str]) -> ShortFit:
+def contact_fit(
+    world: World, episodes: Sequence[Episode], prepared: Prepared, bodies: Sequence[str], known: Sequence[State] = ()
+) -> Segments | None:
+    """Fit the states of the segments with contact to their frames with a model; None without contact.
+
+    Args:
+        world: The world of the model.
+        episodes: Names of the episodes and tracks of their bodies.
+        prepared: The same episodes, cut into segments in the same way for all compared models.
+        bodies: Names of the free bodies in the order of `prepared`.
+        known: States that other models were fitted with, from which this one starts, too.
+    """
+    if not prepared.contact_items:
+        return None
+    whole = _whole(world, episodes, prepared, bodies)
+    cut = Segments.of("contact", world, whole, prepared.contact_items, prepared.noise)
+    return fit_states(cut, thorough=True, also=known)
+
+
+def beside_others(contact: Segments | None, known: Sequence[State]) -> Segments | None:
+    """Return a fit, or the one from the states of other models where it is nearer: no model owes a minimum to luck."""
+    return None if contact is None else fit_states(contact, search=False, also=known)
+
+
+def short_errors(
+    world: World,
+    episodes: Sequence[Episode],
+    prepared: Prepared,
+    bodies: Sequence[str],
+    contact: Segments | None = None,
+) -> ShortFit:
     """Fit the states of all segments to their frames with a model, and return the residuals.
 
     Args:
@@ -91,20 +121,12 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
         episodes: Names of the episodes and tracks of their bodies.
         prepared: The same episodes, cut into segments in the same way for all compared models.
         bodies: Names of the free bodies in the order of `prepared`.
+        contact: The segments with contact where they are fitted already.
     """
-    whole = whole_episodes(world, episodes)
-    columns = [list(bodies).index(world.bodies[k].name) for k in whole.free]
-    whole = replace(
-        whole,
-        seen=prepared.observations.seen[..., columns],
-        has_orientation=prepared.observations.has_orientation[..., columns],
-    )
-    noise, contact = prepared.noise, None
-    flight = None
+    whole, noise, flight = _whole(world, episodes, prepared, bodies), prepared.noise, None
     if prepared.flight is not None:
         flight = fit_states(Segments.of("flight", world, whole, prepared.flight.items, noise))
-    if prepared.contact_items:
-        contact = fit_states(Segments.of("contact", world, whole, prepared.contact_items, noise), thorough=True)
+    contact = contact or contact_fit(world, episodes, prepared, bodies)
     names = [name for name, _ in episodes]
     phases = phases_of(names, whole, prepared.airborne, contact)
     free = tuple(world.bodies[k].name for k in whole.free)
@@ -131,6 +153,17 @@ def short_errors(world: World, episodes: Sequence[Episode], prepared: Prepared, 
         found[one.episode].phase[:] = _placed(places, covered, one.airborne)
         found[one.episode].cause[:] = _causes(found[one.episode])
     return ShortFit(whole, contact, found)
+
+
+def _whole(world: World, episodes: Sequence[Episode], prepared: Prepared, bodies: Sequence[str]) -> Observations:
+    """Return the full episodes in the world's order of bodies, without outliers."""
+    whole = whole_episodes(world, episodes)
+    columns = [list(bodies).index(world.bodies[k].name) for k in whole.free]
+    return replace(
+        whole,
+        seen=prepared.observations.seen[..., columns],
+        has_orientation=prepared.observations.has_orientation[..., columns],
+    )
 
 
 def _fill(segments: Segments, whole: Observations, names: Sequence[str], found: dict[str, ShortErrors]) -> None:

@@ -19,7 +19,7 @@ from ..evaluate.prediction import STATE_FIT_EPISODES
 from ..evaluate.stage import Evaluation, check_bodies, evaluate_model
 from ..evaluate.work import LESS, evaluation_parts
 from ..physics.rollout_cost import durations, segment_part
-from ..physics.world import World
+from ..physics.world import State, World
 from ..report.page_file import links_beside, short_names, shows_the_same
 from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
@@ -32,7 +32,7 @@ from .model_comparison import ComparedModel
 from .page import comparison_html, mark_of
 from .paired_difference import paired_difference, short_difference
 from .residual_wrenches import wrench_points
-from .short_horizon_errors import short_errors
+from .short_horizon_errors import beside_others, contact_fit, short_errors
 from .verdict import comparison_verdict
 
 REPORT_HTML = "compare.html"
@@ -167,13 +167,21 @@ def _with_short_predictions(
         bodies: Names of the free bodies of the first model.
     """
     compared, shown = [], short_names([name for name, _ in models])
+    worlds, contacts = [], []
+    known: list[State] = []
     with one_torch_thread(), progress(desc="compare: short predictions", total=len(models), unit="model") as bar:
-        for (name, model), short_name, evaluation in zip(models, shown, evaluations, strict=True):
+        for _, model in models:
             # group-specific parameters come from the fit or from the same frames as the fitted states
-            world = World.from_model(model)
             flown = after_release(episodes, prepared.released_s)
-            world = with_fitted_groups(world, flown, model.file, capture.groups, prepared.noise)
-            fit = short_errors(world, episodes, prepared, bodies)
+            world = World.from_model(model)
+            worlds.append(with_fitted_groups(world, flown, model.file, capture.groups, prepared.noise))
+            contacts.append(contact_fit(worlds[-1], episodes, prepared, bodies, known))
+            if contacts[-1] is not None:
+                known.append(contacts[-1].observations.state)
+            bar.update(1)
+        every = zip(models, shown, evaluations, worlds, contacts, strict=True)
+        for (name, model), short_name, evaluation, world, contact in every:
+            fit = short_errors(world, episodes, prepared, bodies, beside_others(contact, known))
             points, covariates = wrench_points(world, fit, prepared)
             compared.append(
                 ComparedModel(
@@ -187,7 +195,6 @@ def _with_short_predictions(
                     covariates=covariates,
                 )
             )
-            bar.update(1)
     return compared
 
 

@@ -39,6 +39,7 @@ def fit_states(
     iterations: int | None = None,
     search: bool = True,
     thorough: bool = False,
+    also: Sequence[State] = (),
 ) -> Segments:
     """Fit the state of each segment by Levenberg-Marquardt, with a separate damping for each.
 
@@ -52,16 +53,16 @@ def fit_states(
         thorough: Whether to search several times, and for every segment that fits badly; else only for those that fit
             worse than most: where the contact law misses all of them by far more than the noise, only those can be at a
             wrong minimum.
+        also: Further states (B) to start from, as of another model; a thorough search then searches once.
     """
     given = torch.zeros(0).to(segments.world.gravity) if values is None else values
     count = ITERATIONS[segments.kind] if iterations is None else iterations
     several = search and segments.kind == "contact"
-    best = segments
-    if several:
-        lines = [line_state(segments, frames) for frames in START_FRAMES]
-        best = best_of(segments, lines, parameters, given)
+    lines = [line_state(segments, frames) for frames in START_FRAMES] if several else []
+    starts = [*lines, *also]
+    best = best_of(segments, starts, parameters, given) if starts else segments
     best, cost = _descended(best, parameters, given, count)
-    searches = (SEARCHES if thorough else 1) if several else 0
+    searches = (SEARCHES if thorough and not also else 1) if several else 0
     for seed in range(searches):
         share = cost / segments.dof.clamp_min(1.0)
         usual = 1.0 if thorough else float(share.nanmedian().clamp_min(1.0))
