@@ -86,8 +86,11 @@ class ImpactTest(ContactTest):
         )
 
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
-        """Return the bar, held-out episodes included."""
-        return (replace(self._without_gains, gain_t=self.limits.gain_t),)
+        """Return the bar, held-out episodes included, of which several must carry an effect of several parameters."""
+        slides = THRESHOLDS.sliding
+        flexible = len(equals[0].candidate.effect.parameters) > slides.few_parameters
+        carriers = slides.carriers if flexible else 0
+        return (replace(self._without_gains, gain_t=self.limits.gain_t, carriers=carriers, carries=slides.carries),)
 
 
 def _change(problem: ImpactProblem, start: torch.Tensor, base: int) -> float:

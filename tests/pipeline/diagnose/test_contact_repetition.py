@@ -1,11 +1,13 @@
 """Evidence of contact that repeats: an effect in every episode against one episode's, and equals by sessions."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from cgwm.pipeline.diagnose import flight_findings
+from cgwm.pipeline.diagnose.contact_tests.impact import ImpactTest
 from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
 from cgwm.pipeline.diagnose.effect_selection import SelectionStep
 from cgwm.pipeline.diagnose.evidence import Evidence
@@ -162,3 +164,11 @@ def test_slides_that_the_model_explains_down_to_the_noise_name_nothing(cost: flo
     sliding = SimpleNamespace(base=SimpleNamespace(cost=cost), segments=SimpleNamespace(dof=np.array([400.0, 600.0])))
     data: Any = SimpleNamespace(flown=False, explained=True, sliding=sliding)
     assert bool(SlidingTest().bars([evidence("viscous_friction")], data)) == named
+
+
+@pytest.mark.parametrize(("gains", "named"), [((0.0, -0.2, 33.9, 0.0, 0.7), False), ((9.0, 8.0, 12.0, 0.5, 4.0), True)])
+def test_a_friction_map_is_not_named_from_the_impacts_of_one_episode(gains: tuple[float, ...], named: bool) -> None:
+    one = replace(evidence("friction_patch", (1.0,) * 9), gains=gains, share=0.9, score=94.0)
+    one = replace(one, numbers={p.name: (1.0, 0.5) for p in one.candidate.effect.parameters})
+    data: Any = None
+    assert any(bar.passed(one) for bar in ImpactTest().bars([one], data)) == named
