@@ -66,8 +66,6 @@ EACH, NULLS = 4, 12
 NAMED = ("exact", "exact, and more")
 COLUMNS = ("exact", "exact, and more", "among", "silent", "family", "wrong", "unexplained", "refused")
 LEAST_NAMED, MOST_WRONG = 0.8, 0.05
-NOT_SHOWN = (("velocity_restitution", "cube"),)
-"""Effects on bodies that no test of a diagnosis names, beside adhesion."""
 WRONG = ("exact, and more", "family", "wrong", "false alarm")
 KNOWN_ENGINES.update({group: module for group, (module, _) in GROUPS.items()})
 
@@ -356,17 +354,9 @@ def record_figures(rows: Sequence[dict[str, Any]], command: str, planned: int) -
     head, engines = "experiments in sequence", ", ".join(sorted({ENGINE_OF[row["group"]] for row in hidden}))
     if len(rows) < planned:
         engines += f"; the first {len(rows)} of {planned} captures in random order"
-    shown = [row for row in hidden if (row["effect"], row["thing"]) not in NOT_SHOWN and row["effect"] != "adhesion"]
     what = "large effects of contact, named"
     for figure, marks, least, most in (
         (f"{head}: {what} after two rounds", [row["judged"][-1] in NAMED for row in hidden], LEAST_NAMED, None),
-        (f"{head}: {what} after one round", [row["judged"][1] in NAMED for row in hidden], None, None),
-        (
-            f"{head}: {what} after two rounds, without adhesion and the restitution of boxes",
-            [row["judged"][-1] in NAMED for row in shown],
-            None,
-            None,
-        ),
         (f"{head}: {what} before", [row["judged"][0] in NAMED for row in hidden], None, None),
         (f"{head}: a wrong name after two rounds", [row["judged"][-1] in WRONG for row in hidden], None, MOST_WRONG),
         (f"{head}: nothing hidden, a wrong name", [row["judged"][-1] in WRONG for row in nulls], None, MOST_WRONG),
