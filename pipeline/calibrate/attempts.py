@@ -190,8 +190,8 @@ def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[Mapped], st
     if not best:
         return [], ""
     largest, taken = _supported(best[0], start, inputs, seed)
-    if _uncertain(largest, taken, inputs):
-        largest, taken = _aligned(best[0], start, database, inputs, seed)
+    if largest.image_count >= MIN_REGISTERED_FRACTION * len(inputs.sources) and _uncertain(largest, taken, inputs):
+        largest, taken = _aligned(largest, taken, best[0], start, database, inputs, seed)
     return [largest, *best[1:]], taken
 
 
@@ -212,20 +212,32 @@ def _uncertain(mapped: Mapped, camera_model: str, inputs: Inputs) -> bool:
     return max(center_stds(model, estimated(camera_model, model, inputs)).values()) > _CERTAIN_CENTER
 
 
-def _aligned(mapped: Mapped, start: str, database: Path, inputs: Inputs, seed: int) -> tuple[Mapped, str]:
+def _aligned(
+    largest: Mapped, taken: str, mapped: Mapped, start: str, database: Path, inputs: Inputs, seed: int
+) -> tuple[Mapped, str]:
     """Return what `_supported` does, of points whose places in the photos are aligned to each other.
 
-    With the cameras of the first round the points of all matches are found anew, and looked for in further photos.
+    With the cameras of the first round the points of all matches are found anew, and looked for in further photos. A
+    model that would lose a photo by that stays as it was.
     """
     photos = {name: _brightness(inputs.root / name) for name in mapped.model().T_cam_world}
-    taken = start
     for further in (False, True):
         if further:
-            mapped = triangulated(mapped, database, inputs.root, seed)
-        mapped = adjusted(mapped, limited(start, inputs), inputs.known, seed)
-        mapped = mapped.with_observations(aligned(mapped.model(), photos, further))
-        mapped, taken = _supported(mapped, start, inputs, seed)
-    return mapped, taken
+            mapped = triangulated(largest, database, inputs.root, seed)
+        if not _all_seen(mapped):
+            break
+        adjusted_first = adjusted(mapped, limited(start, inputs), inputs.known, seed)
+        finer = adjusted_first.with_observations(aligned(adjusted_first.model(), photos, further))
+        finer, lens = _supported(finer, start, inputs, seed)
+        if not _all_seen(finer):
+            break
+        largest, taken = finer, lens
+    return largest, taken
+
+
+def _all_seen(mapped: Mapped) -> bool:
+    """Return whether each registered image sees points."""
+    return all(len(seen) for _, seen in mapped.model().observations.values())
 
 
 def _brightness(photo: Path) -> NDArray[np.float32]:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 from cgwm.datasets.synthetic.rig import look_at
+from cgwm.pipeline.calibrate import attempts
 from cgwm.pipeline.calibrate.mapping import Mapped
 from cgwm.pipeline.calibrate.reconstruction import SfmCamera, SfmModel
 from cgwm.pipeline.calibrate.track_alignment import aligned
@@ -101,3 +102,14 @@ def test_other_observations_make_the_same_model_of_colmap() -> None:
         assert np.allclose(again.T_cam_world[name], pose)
         assert np.allclose(again.observations[name][0], moved[name][0])
     assert np.allclose(again.points, model.points) and again.cameras == model.cameras
+
+
+def test_a_model_whose_photo_sees_no_point_is_known_for_it() -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 3, 20
+    found = Mapped(reconstruction=pycolmap.synthesize_dataset(options), names={1: "photos"})
+    assert attempts._all_seen(found)  # pyright: ignore[reportPrivateUsage]
+    model = found.model()
+    last = list(model.observations)[-1]
+    blind = model.observations | {last: (np.zeros((0, 2)), np.zeros(0, np.int64))}
+    assert not attempts._all_seen(found.with_observations(replace(model, observations=blind)))  # pyright: ignore[reportPrivateUsage]
