@@ -304,7 +304,6 @@ class Thresholds:
     """Sliding test."""
     impact: ImpactThresholds = field(default_factory=ImpactThresholds)
     """Impact test."""
-    """Friction consistency test."""
     segments: SegmentsThresholds = field(default_factory=SegmentsThresholds)
     """Test in contact segments, and separation of flight equals."""
     experiment: ExperimentThresholds = field(default_factory=ExperimentThresholds)
