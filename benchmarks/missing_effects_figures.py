@@ -21,7 +21,7 @@ def record_figures(rows: Sequence[Row], command: str) -> None:
     for who in dict.fromkeys(row["contender"] for row in rows):
         own = [row for row in rows if row["contender"] == who]
         for figure in figures(who, own):
-            record("diagnose", command=command, **figure)
+            record("real_like", command=command, **figure)
 
 
 def figures(who: str, rows: Sequence[Row]) -> Iterator[Row]:

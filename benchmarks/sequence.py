@@ -366,7 +366,7 @@ def record_figures(rows: Sequence[dict[str, Any]], command: str, planned: int) -
         met = share >= least if least is not None else share <= most if most is not None else None
         target = f"{100 * least:g} %" if least is not None else f"at most {100 * most:g} %" if most is not None else ""
         record(
-            "diagnose",
+            "real_like",
             figure=figure,
             value=f"{sum(marks)} of {len(marks)} ({100 * share:.0f} %)",
             target=target,
