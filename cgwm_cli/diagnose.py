@@ -95,7 +95,7 @@ def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> 
     from .output import next_line, table, warnings
 
     words = next_command(result, model, capture, split)
-    rows = [_row(entry) for entry in _shown(result)]
+    rows = [_row(entry, result) for entry in _shown(result)]
     lines = [result.sentence, table(rows, ["effect", "acts in", "judged in", "p", "evidence", "estimate"])]
     if result.flight_before is not None and result.flight_after is not None:
         before, after = result.flight_before.statistic, result.flight_after.statistic
@@ -126,10 +126,12 @@ def _held_out_errors(ranking: Sequence[RankedEffect]) -> list[str]:
     from .output import millimetres
 
     lines = []
-    for entry in ranking:
-        if entry.cv_error_before_m is not None and entry.cv_error_after_m is not None:
-            errors = f"{millimetres(entry.cv_error_before_m)} -> {millimetres(entry.cv_error_after_m)}"
-            lines.append(f"{entry.effect}: error of short predictions in episodes held out from its fit {errors}")
+    tried = [one for one in ranking if one.cv_error_before_m is not None and one.cv_error_after_m is not None]
+    beside = ", beside the others" if len(tried) > 1 else ""
+    for one in tried:
+        errors = f"{millimetres(one.cv_error_before_m or 0.0)} -> {millimetres(one.cv_error_after_m or 0.0)}"
+        what = f"error of short predictions in held-out episodes, without and with it{beside}"
+        lines.append(f"{one.effect}: {what}: {errors}")
     return lines
 
 
@@ -196,7 +198,7 @@ def _experiment(found: NextExperiment) -> list[str]:
     return lines
 
 
-def _row(entry: RankedEffect) -> list[str]:
+def _row(entry: RankedEffect, result: DiagnoseResult) -> list[str]:
     numbers = ", ".join(f"{p.name} = {p.estimate:.3g} +- {p.std_error:.2g} {p.unit}" for p in entry.parameters[:3])
     if len(entry.parameters) > 3:
         numbers += ", ..."
@@ -209,13 +211,26 @@ def _row(entry: RankedEffect) -> list[str]:
         ", ".join(entry.acts_in),
         entry.judged_in,
         f"{entry.score_p:.2g}",
-        _evidence(entry),
+        _evidence(entry, result),
         numbers,
     ]
 
 
-def _evidence(entry: RankedEffect) -> str:
-    """Return the figure that decides: the fall of BIC in flight, the score in contact; empty without a refit."""
+def _evidence(entry: RankedEffect, result: DiagnoseResult) -> str:
+    """Return the figure that decides: the fall of BIC in flight, the score in contact; empty without a refit.
+
+    An effect that was named after others was judged beside these, and so were its equals.
+    """
     if entry.judged_in == "contact" and entry.contact_score is not None:
         return f"score {entry.contact_score:.0f}"
-    return "" if entry.delta_bic is None else f"BIC {entry.delta_bic:+.0f}"
+    if entry.delta_bic is None:
+        return ""
+    from ..pipeline.report.page import listed
+
+    places = [k for k, name in enumerate(result.selected) if entry.effect in _equals_of(name, result)]
+    beside = result.selected[: places[0]] if places else ()
+    return f"BIC {entry.delta_bic:+.0f}" + (f" beside {listed(beside)}" if beside else "")
+
+
+def _equals_of(name: str, result: DiagnoseResult) -> tuple[str, ...]:
+    return next((group for group in result.aliases if name in group), (name,))

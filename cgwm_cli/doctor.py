@@ -32,7 +32,7 @@ def _summary(report: DoctorReport) -> str:
     lines += [f"  missing: {item.what} ({item.why}). Next: {item.todo}" for item in report.missing]
     machine = [
         ["python", f"{report.python} on {report.platform}"],
-        ["cores, memory", f"{report.cpu_cores}, {report.memory_gib:.1f} GiB"],
+        ["cores, memory for cgwm", f"{report.cpu_cores}, {report.memory_gib:.1f} GiB"],
         ["CUDA", ", ".join(report.cuda_devices) or "no device"],
         ["cuda-core", report.cuda_core or "not installed (optional)"],
         ["EGL", "loads" if report.egl else "not found (optional)"],

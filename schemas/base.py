@@ -125,6 +125,8 @@ def _message(fault: Any, location: tuple, data: Any) -> str:
         message = f"input should be {bound[1]} {limit:g}"  # pydantic writes 1e-12 with all its zeros
     if fault["type"] == "string_pattern_mismatch":
         message = "a name begins with a letter or digit and holds only letters, digits, '_', '.' and '-'"
+    if fault["type"] == "model_type":
+        message = "input should be a table"  # pydantic names the class, too
     # "valid tuple" is Python's word for what is a list in the file.
     message = (
         (message[:1].lower() + message[1:]).replace("a valid tuple", "a list").replace("a valid dictionary", "a table")

@@ -15,6 +15,8 @@ Order = Literal["wxyz", "xyzw", "inverse"]
 
 LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
 """Units of length in metres."""
+MISREAD = {"millimetres taken for centimetres": 0.1, "centimetres taken for millimetres": 10.0}
+"""Units of length taken for each other, and the factor that mends it."""
 TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "minutes": 60.0}
 """Units of time in seconds."""
 FRAME_RATES = (24, 25, 30, 50, 60, 90, 100, 120, 200, 240, 250, 300, 400, 500)
@@ -68,6 +70,13 @@ def unit_corrections() -> Iterator[Correction]:
             remedy=f"multiply px_m, py_m, pz_m by {factor:g}.",
             length=factor,
             exact=factor > 0.02,
+        )
+    for name, factor in MISREAD.items():
+        yield Correction(
+            mistake=f"the tracks' positions are 10 times too {'large' if factor < 1 else 'small'}, as of {name}",
+            remedy=f"multiply px_m, py_m, pz_m by {factor:g}, or import again with the right --length-unit.",
+            length=factor,
+            exact=True,
         )
     for name in ("millimetres", "centimetres"):
         yield Correction(

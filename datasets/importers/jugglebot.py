@@ -44,6 +44,8 @@ _HALF_WINDOW_S, _TOLERANCE_M_S2 = 0.05, 2.0
 _LEAVES_M, _MARGIN = 0.0015, 5
 """Deviation of the measurement from the fit that ends flight (the noise is 0.4 mm), and samples removed before it."""
 _SHORTEST_S = 0.3
+_LONGEST_THROW_M = 50.0
+"""Spread of positions above which a message names it: a wrong unit is likely."""
 _TODO = "get the recordings of github.com/Project-DeepBlue-Juggling/Jugglebot."
 
 
@@ -74,15 +76,18 @@ def import_jugglebot(
     """
     with new_directory(out, "capture", overwrite) as directory:
         sessions = _sessions(Path(source), only)
-        recordings = []
+        recordings, lost = [], []
         for path, session in zip(sessions, episode_names([path.stem for path in sessions]), strict=True):
             throws = _read_npz(path) if path.suffix == ".npz" else _read_json(path)
             for number, (time, position) in enumerate(throws):
                 where = f"{path}: throw {number}"
+                if (gaps := np.count_nonzero(~np.isfinite(position).all(1))) > 0:
+                    lost.append(f"{where}: {gaps} of {len(position)} samples have no position and are left out.")
                 recordings.append(_throw(where, f"{session}-{number:02d}", session, time, position))
         splits = drawn_splits(recordings, n_train, n_test, seed)
         ball = Body(name=BALL, shape=Shape(sphere=SphereShape(radius_m=RADIUS_M)))
-        return write_recordings(directory, out, World(), (ball,), recordings, splits)
+        result = write_recordings(directory, out, World(), (ball,), recordings, splits)
+        return result.model_copy(update={"warnings": (*result.warnings, *lost)})
 
 
 def flight(time: Array, position: Array) -> tuple[int, int]:
@@ -147,7 +152,10 @@ def _throw(where: str, name: str, session: str, time: Array, position: Array) ->
             raise ValueError(f"{len(time)} samples, or times that do not increase")
         first, last = flight(time, position)
     except ValueError as error:
-        raise InputDataError(f"{where}: {error}.", "a ball that is thrown and falls, z up.", _TODO) from None
+        spread = float(np.ptp(position, axis=0).max(initial=0.0)) if len(position) else 0.0
+        wide = f" Its positions spread over {spread:.4g} m." if spread > _LONGEST_THROW_M else ""
+        allowed = "a ball that is thrown and falls, z up, in metres (.npz) or millimetres (.json)."
+        raise InputDataError(f"{where}: {error}.{wide}", allowed, _TODO) from None
     track = Track(time[first:] - time[first], position[first:])
     return Recording(name=name, tracks={BALL: track}, group=session, end_s=round(float(time[last] - time[first]), 6))
 

@@ -64,7 +64,7 @@ def diagnosis_html(
         f'<p class="verdict">{text(result.sentence)}</p>',
         _cards(result),
         cautions(result.warnings),
-        command(then) if then else "",
+        paragraph("Next:") + command(then) if then else "",
         _ranking(result),
         _missing(result, pictures),
         *(_effect(result, one) for one in pictures.effects),
@@ -106,13 +106,15 @@ def _ranking(result: DiagnoseResult) -> str:
     flight = [one for one in result.ranking if one.delta_bic is not None]
     contact = [one for one in result.ranking if one.delta_bic is None and one.contact_score is not None]
     pieces = []
-    if flight:
+    for step, entries in enumerate(_by_step(flight, result)):
         words = (
             "In flight: how much better the data are described with the effect, as the fall of BIC (twice the rise of "
             "the log-likelihood, less a charge for each fitted number and for an implausible size). A difference of 10 "
             "between two effects is strong evidence for the longer bar."
         )
-        pieces += [paragraph(words), _bars(flight, result, lambda one: -(one.delta_bic or 0.0))]
+        if step:
+            words = f"The same beside {listed(result.selected[:step])}, which the data were fitted with before:"
+        pieces += [paragraph(words), _bars(entries, result, lambda one: -(one.delta_bic or 0.0))]
     if contact:
         pieces += _in_contact(contact, result)
     pieces.append(_all_candidates(result))
@@ -121,6 +123,21 @@ def _ranking(result: DiagnoseResult) -> str:
         for group in result.aliases
     ]
     return section("Which effect explains the data", *pieces)
+
+
+def _by_step(flight: Sequence[RankedEffect], result: DiagnoseResult) -> list[list[RankedEffect]]:
+    """Return the candidates judged in flight by the step that judged them: bars of different steps do not compare.
+
+    A further step shows the effect that it named and the equals of that one; of all others the ranking has the figures
+    of the first step.
+    """
+    known = {one.effect for one in flight}
+    later = []
+    for name in [name for name in result.selected if name in known][1:]:
+        group = next((group for group in result.aliases if name in group), (name,))
+        later.append([one for one in flight if one.effect in group])
+    first = [one for one in flight if not any(one in group for group in later)]
+    return [group for group in (first, *later) if group]
 
 
 def _in_contact(entries: Sequence[RankedEffect], result: DiagnoseResult) -> list[str]:

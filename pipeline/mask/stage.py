@@ -99,6 +99,8 @@ def _photos(source: Path, body: str | None) -> _Photos:
         names = capture.photos()
         folder, bodies = source / "images", [one.name for one in capture.manifest.bodies]
     else:
+        if not source.exists():
+            raise InputDataError(f"{source}: no such folder.", "a folder of photos, or a capture.", "correct the path.")
         names = [entry.name for entry in entries_of(source) if entry.suffix.lower() in IMAGE_SUFFIXES]
         folder, bodies = source, []
     if not names:

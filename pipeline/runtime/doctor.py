@@ -235,7 +235,7 @@ def _threads() -> str:
 
 def _uses(cuda: tuple[str, ...], zstd: bool) -> dict[str, str]:
     return {
-        "device": f"cuda ({cuda[0]})" if cuda else f"cpu, {processors()} cores",
+        "device": f"cuda ({cuda[0]})" if cuda else f"cpu, {processors()} core" + "s" * (processors() > 1),
         "renderer": _renderer(bool(cuda)),
         "rollouts": _rollouts(),
         "threads": _threads(),

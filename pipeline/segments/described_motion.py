@@ -154,7 +154,10 @@ class _Predicted:
         measured = self.seen.seen.amax(-1) > 0
         nearest = float(torch.where(measured, gap, torch.inf).amin(1).median())
         if nearest == np.inf:
-            return "the model has nothing to touch: no ground, and no other body. Add [world] ground to capture.toml"
+            return (
+                "the model has nothing to touch: no ground, and no other body. Add [world] ground to capture.toml: "
+                "ground = { normal = [0, 0, 1], offset_m = 0 }"
+            )
         if nearest > LIMITS.near_sizes * self.size_m:
             return (
                 f"the measured body stays {1e3 * nearest:.0f} mm away from all that it could touch: the ground lies "

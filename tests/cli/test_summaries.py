@@ -126,5 +126,5 @@ def test_doctor() -> None:
         "cgwm 0.1.0: not ready.",
         "  missing: mujoco (not installed). Next: pip install 'mujoco<4,>=3.17'",
     ]
-    assert "  cores, memory  2, 23.5 GiB" in lines
+    assert "  cores, memory for cgwm  2, 23.5 GiB" in lines
     assert lines[-2:] == ["What cgwm would use", "  device  cpu, 2 cores"]
