@@ -15,7 +15,7 @@ from ...schemas import CalibrateConfig, NotConvergedError
 from ...schemas.calibration import CalibrationAttempt, ImageVerdict, PairFigures, SelfCheckFigures
 from . import colmap
 from .camera_models import FIRST_TRIED, LADDER, richer, supported
-from .center_uncertainty import center_stds, focal_stds
+from .center_uncertainty import UNCERTAIN_CENTER, center_stds, focal_stds
 from .consistency_check import SelfCheck, check_model
 from .focal_prior import EXIF_STD, FocalLength, focal_lengths
 from .mapping import Mapped, adjusted, map_database, triangulated, with_focal_lengths, without_outliers
@@ -34,11 +34,6 @@ _THOROUGH_TRIALS = 10000  # COLMAP's default: finds pairs with few true matches
 _TIGHT_RATIO = 0.7  # Lowe's test for repeated texture
 _RICHEST_ON_TURNTABLE = "RADIAL"
 """Tangential distortion can hardly be told from a rotation of the camera where the camera always stands alike."""
-
-
-_CERTAIN_CENTER = 0.005
-"""Standard deviation of optical centres, as a fraction of their extent, up to which features are fine enough: that at
-which a warning would be given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,7 +204,7 @@ def _supported(mapped: Mapped, start: str, inputs: Inputs, seed: int) -> tuple[M
 def _uncertain(mapped: Mapped, camera_model: str, inputs: Inputs) -> bool:
     """Return whether the centres are so uncertain that finer places of the points are worth their time."""
     model = mapped.model()
-    return max(center_stds(model, estimated(camera_model, model, inputs)).values()) > _CERTAIN_CENTER
+    return max(center_stds(model, estimated(camera_model, model, inputs)).values()) > UNCERTAIN_CENTER
 
 
 def _aligned(

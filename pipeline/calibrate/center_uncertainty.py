@@ -29,6 +29,10 @@ PRINCIPAL_STD = 0.003
 """Standard deviation of a coordinate of the principal point about the middle, as a fraction of the picture's diagonal:
 a lens is centred on a sensor to some tenths of a millimetre. Matches on one object hardly tell it from a rotation."""
 
+UNCERTAIN_CENTER = 0.005
+"""Standard deviation of an optical centre, as a fraction of the extent of all, above which a warning is given; where
+one would be, places of points in the photos are aligned first."""
+
 _FLOOR = 1e-9
 """Least information of a number that scales it, relative to the largest."""
 
@@ -55,7 +59,18 @@ def center_stds(
         Standard deviation by image, as a fraction of the diagonal of the box around all centres; infinite where the
         observations do not determine the cameras.
     """
+    return pose_stds(model, models, with_exif, motion)[0]
+
+
+def pose_stds(
+    model: SfmModel, models: Map[str, str], with_exif: Collection[str] = (), motion: TurntableMotion | None = None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return what `center_stds` and `rotation_stds` do, from one covariance; arguments as there."""
     variances, _ = _variances(model, models, with_exif, motion)
+    return _of_centers(model, variances), _of_rotations(model, models, variances)
+
+
+def _of_centers(model: SfmModel, variances: Array) -> dict[str, float]:
     centers = model.centers()
     extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
     sums = variances[: POSE * len(centers)].reshape(-1, POSE)[:, :3].sum(1) / extent**2
@@ -75,7 +90,10 @@ def rotation_stds(
         with_exif: As there.
         motion: As there.
     """
-    variances, _ = _variances(model, models, with_exif, motion)
+    return pose_stds(model, models, with_exif, motion)[1]
+
+
+def _of_rotations(model: SfmModel, models: Map[str, str], variances: Array) -> dict[str, float]:
     turns = variances[: POSE * len(model.T_cam_world)].reshape(-1, POSE)[:, 3:].sum(1)
     stds = {}
     for image, variance in zip(model.T_cam_world, turns, strict=True):

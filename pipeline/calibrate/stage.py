@@ -38,7 +38,7 @@ from ...schemas.calibration import CalibrationAttempt, CalibrationReport, FocalF
 from ..runtime.work_budget import Part, within_budget
 from . import colmap
 from .attempts import MIN_PHOTOS, Candidate, check_figures, estimated, photo_count, photo_labels, search, verdict
-from .center_uncertainty import center_stds, rotation_stds
+from .center_uncertainty import UNCERTAIN_CENTER, pose_stds
 from .depth_scale import from_depth
 from .given_intrinsics import read_intrinsics
 from .markers import detect_markers, dictionary
@@ -54,8 +54,6 @@ REPORT_NAME = "calibration.json"
 _TEMPORARY = "the photos and COLMAP's database"
 _FEATURE_BYTES = 76
 """Lower bound of a feature in the database [bytes]: half of its descriptor and place."""
-UNCERTAIN_CENTER = 0.005
-"""Standard deviation of an optical centre, as a fraction of the extent of all, above which a warning is given."""
 UNCERTAIN_ROTATION_DEG = 0.5
 """Standard deviation of a camera's rotation [deg] above which a warning is given: beyond a degree one time in 20."""
 _MANY_WITHOUT_STRONG = 0.5
@@ -272,7 +270,7 @@ def _report(
     scale: Scale,
     world_frame: str,
 ) -> CalibrationReport:
-    stds, turns = _center_stds_percent(best, inputs), _rotation_stds_deg(best, inputs)
+    stds, turns = _pose_stds(best, inputs)
     verdicts = {
         source.label: verdict(source.label, best).model_copy(
             update={"center_std_percent": stds.get(source.label), "rotation_std_deg": turns.get(source.label)}
@@ -314,17 +312,13 @@ def _report(
     )
 
 
-def _center_stds_percent(best: Candidate, inputs: Inputs) -> dict[str, float]:
-    """Return the standard deviation of each optical centre [% of their extent], at most 100."""
-    return {image: round(min(100.0 * std, 100.0), 4) for image, std in center_stds(*_estimated(best, inputs)).items()}
-
-
-def _rotation_stds_deg(best: Candidate, inputs: Inputs) -> dict[str, float]:
-    """Return the standard deviation of each camera's rotation [deg], at most 180."""
-    return {
-        image: round(min(float(np.degrees(std)), 180.0), 3)
-        for image, std in rotation_stds(*_estimated(best, inputs)).items()
-    }
+def _pose_stds(best: Candidate, inputs: Inputs) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the standard deviations of optical centres [% of their extent], at most 100, and rotations [deg], 180."""
+    centers, turns = pose_stds(*_estimated(best, inputs))
+    return (
+        {image: round(min(100.0 * std, 100.0), 4) for image, std in centers.items()},
+        {image: round(min(float(np.degrees(std)), 180.0), 3) for image, std in turns.items()},
+    )
 
 
 def _estimated(best: Candidate, inputs: Inputs) -> tuple[SfmModel, dict[str, str], list[str], TurntableMotion | None]:

@@ -105,7 +105,7 @@ def _unmatched(model: SfmModel, images: Sequence[str], seen: _Sightings) -> _Sig
         with np.errstate(divide="ignore", invalid="ignore"):
             pixel = camera.project(local)
         inside = (pixel > RADIUS).all(1) & (pixel < np.array([camera.width, camera.height]) - RADIUS).all(1)
-        alike = (_views(model, model.center(image), model.points) * many).sum(1) > _VIEW_COS
+        alike = (_views(model.center(image), model.points) * many).sum(1) > _VIEW_COS
         wanted = inside & alike & (local[:, 2] > 0) & (views >= _LEAST_VIEWS)
         wanted[seen.point[seen.photo == k]] = False
         index = np.flatnonzero(wanted)
@@ -116,8 +116,9 @@ def _unmatched(model: SfmModel, images: Sequence[str], seen: _Sightings) -> _Sig
     return _Sightings(np.concatenate(photo), index, np.concatenate(place), np.zeros(len(index), bool))
 
 
-def _views(model: SfmModel, center: Array, points: Array) -> Array:
-    ways = center - points
+def _views(centers: Array, points: Array) -> Array:
+    """Return the unit vectors from points (n, 3) to a centre (3,), or to one (n, 3) each."""
+    ways = centers - points
     return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
 
 
@@ -126,16 +127,14 @@ def _mean_views(model: SfmModel, images: Sequence[str], seen: _Sightings) -> Arr
     centers = np.array([model.center(image) for image in images])
     mean = np.zeros_like(model.points)
     own = seen.matched
-    ways = centers[seen.photo[own]] - model.points[seen.point[own]]
-    np.add.at(mean, seen.point[own], ways / np.linalg.norm(ways, axis=1, keepdims=True))
+    np.add.at(mean, seen.point[own], _views(centers[seen.photo[own]], model.points[seen.point[own]]))
     return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def _references(model: SfmModel, images: Sequence[str], seen: _Sightings, mean: Array) -> Ids:
     """Return the sighting that is the reference of each point, shape (point,)."""
     centers = np.array([model.center(image) for image in images])
-    ways = centers[seen.photo] - model.points[seen.point]
-    like = (ways * mean[seen.point]).sum(1) / np.linalg.norm(ways, axis=1)
+    like = (_views(centers[seen.photo], model.points[seen.point]) * mean[seen.point]).sum(1)
     order = np.lexsort((-np.where(seen.matched, like, -2.0), seen.point))
     first = order[np.r_[True, np.diff(seen.point[order]) != 0]]
     reference = np.zeros(len(model.points), np.int64)
