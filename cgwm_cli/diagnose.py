@@ -227,10 +227,6 @@ def _evidence(entry: RankedEffect, result: DiagnoseResult) -> str:
         return ""
     from ..pipeline.report.page import listed
 
-    places = [k for k, name in enumerate(result.selected) if entry.effect in _equals_of(name, result)]
+    places = [k for k, name in enumerate(result.selected) if entry.effect in result.equals_of(name)]
     beside = result.selected[: places[0]] if places else ()
     return f"BIC {entry.delta_bic:+.0f}" + (f" beside {listed(beside)}" if beside else "")
-
-
-def _equals_of(name: str, result: DiagnoseResult) -> tuple[str, ...]:
-    return next((group for group in result.aliases if name in group), (name,))

@@ -252,3 +252,7 @@ class DiagnoseResult(FileModel):
     not_tested: dict[str, str] = {}
     """Candidates that these data cannot judge, and why."""
     warnings: tuple[str, ...] = ()
+
+    def equals_of(self, name: str) -> tuple[str, ...]:
+        """Return the effects that these data cannot tell from a selected one, itself among them."""
+        return next((group for group in self.aliases if name in group), (name,))

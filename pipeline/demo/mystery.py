@@ -191,7 +191,7 @@ def _named(diagnosis: DiagnoseResult, names: set[str]) -> tuple[Outcome, str]:
     if not names:
         return "wrong", f"Nothing was hidden, but {listed(selected)} was named: a false alarm."
     hidden = _were_hidden(names)
-    classes = [next((group for group in diagnosis.aliases if name in group), (name,)) for name in selected]
+    classes = [diagnosis.equals_of(name) for name in selected]
     if not names <= {name for group in classes for name in group}:
         return "wrong", f"{hidden}, but {listed(selected)} was named: wrong."
     extra = [name for name, group in zip(selected, classes, strict=True) if not names & set(group)]

@@ -134,8 +134,7 @@ def _by_step(flight: Sequence[RankedEffect], result: DiagnoseResult) -> list[lis
     known = {one.effect for one in flight}
     later = []
     for name in [name for name in result.selected if name in known][1:]:
-        group = next((group for group in result.aliases if name in group), (name,))
-        later.append([one for one in flight if one.effect in group])
+        later.append([one for one in flight if one.effect in result.equals_of(name)])
     first = [one for one in flight if not any(one in group for group in later)]
     return [group for group in (first, *later) if group]
 
