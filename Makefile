@@ -16,7 +16,7 @@ help:
 	@echo 'make demo      run the whole pipeline on a scene that it makes itself; the report: $(OUT)/report.html'
 	@echo 'make test      lint, type check of the package and tests, as the continuous integration runs them'
 	@echo 'make install   only install cgwm into $(VENV)/ (the two above do it by themselves)'
-	@echo 'make lint      ruff and pyright alone, of the tests too'
+	@echo 'make lint      ruff and pyright alone, of tests and benchmarks too'
 	@echo 'make same      compare what this tree computes with the outputs of the last commit (tools/same.py)'
 	@echo 'make graph     print the import graph of the rooms, and draw it: docs/import-graph.svg'
 	@echo 'make docs      build the documentation as a site that is read offline: build/docs/index.html'

@@ -169,7 +169,7 @@ def _projected(
         position, rotation = moved(world, hidden, start)
         turned = Rotation.from_matrix(np.einsum("tji,tjk->tik", base[1], rotation)).as_rotvec()
         parts = zip(piece.roots, (position - base[0], turned), strict=True)
-        return np.concatenate([np.linalg.solve(root, part).ravel() for root, part in parts])
+        return np.concatenate([np.linalg.solve(root, part).ravel() for root, part in parts], dtype=float)
 
     thing, mu = world.thing, world.friction[0]
     rougher = replace(

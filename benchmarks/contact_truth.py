@@ -25,7 +25,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.geometry.mesh import mesh_mass_properties, read_mesh
 from cgwm.pipeline.geometry.rotation import geodesic_angle
 from cgwm.pipeline.optimization.importance_sampling import NormalPrior, importance_search
@@ -194,7 +194,7 @@ def fitted(world: World, tosses: Tosses, seed: int) -> tuple[Array, World]:
     """Return the shared parameters and the world with them, by the search of the stage phys-geo."""
     names = [*CONTACT_PARAMETERS, GROUND_SHIFT]
     episodes = [
-        (f"toss{k}", {"body": Track(tosses.times_s, tosses.position_m[k], tosses.quat_wxyz[k])})
+        Episode(f"toss{k}", {"body": Track(tosses.times_s, tosses.position_m[k], tosses.quat_wxyz[k])})
         for k in range(len(tosses.position_m))
     ]
     observations = Observations.of(world, episodes, [(0.0, LENGTH_S + 1e-9)] * len(episodes))

@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from cgwm.datasets.capture.tracks import Episode
 from cgwm.datasets.synthetic import plan_scene, read_truth
 from cgwm.datasets.synthetic.dynamics import STEPS_PER_S, Motion
 from cgwm.datasets.synthetic.objects import SolidObject
@@ -95,8 +96,8 @@ def own_motion(plan: ScenePlan, toss: EpisodePlan) -> Motion:
 def tracked(plan: ScenePlan, toss: EpisodePlan, device: Device) -> tuple[FittedParameter, ...]:
     """Return what a fit to the toss's measured track finds, on the object's true corners."""
     world = replace(world_of(plan.solid), rolls_on=resolve_device(device).type)
-    noise = Noise(POSITION_STD, float(ROTATION_STD))
-    return fit_physics(world, [(toss.name, measure_tracks(plan, toss))], PhysConfig(seed=plan.seed), noise).parameters
+    noise, episode = Noise(POSITION_STD, float(ROTATION_STD)), Episode(toss.name, measure_tracks(plan, toss))
+    return fit_physics(world, [episode], PhysConfig(seed=plan.seed), noise).parameters
 
 
 def filmed(plan: ScenePlan, toss: EpisodePlan, device: Device) -> tuple[FittedParameter, ...]:

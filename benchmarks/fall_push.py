@@ -200,7 +200,7 @@ def drawn(names: dict[str, Sequence[str]], captures: int | None) -> list[tuple[s
         for engine in names["engines"]
     }
     cells = [
-        (index, (task, *pair, engine))
+        (index, (task, pair[0], pair[1], engine))
         for engine in names["engines"]
         for task in names["tasks"]
         for index, pair in enumerate([one for one in able[engine] if (task, one[0]) not in UNABLE][:captures])

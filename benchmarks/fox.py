@@ -24,6 +24,7 @@ from cgwm.pipeline.rendering.image_metrics import psnr, ssim_map
 from cgwm.pipeline.sg_gs.stage import fit_scene
 from cgwm.pipeline.sg_gs.views import View, load_views
 from cgwm.schemas import SplatConfig
+from cgwm.schemas.config import Device
 from store import shared_data
 from torch import Tensor
 
@@ -38,7 +39,7 @@ def capture_of(photos: Path, folder: Path) -> Capture:
     return Capture.open(folder)
 
 
-def ours(capture: Capture, spheres: int, iterations: int, device: str, **settings: bool) -> dict[str, Any]:
+def ours(capture: Capture, spheres: int, iterations: int, device: Device, **settings: Any) -> dict[str, Any]:
     """Return the figures of the stage sg-gs."""
     config = SplatConfig(
         spheres=spheres,

@@ -117,4 +117,4 @@ def run_cem(controller: HandController, scene: Path, seed: int, most_s: float) -
 
 
 def _spline(times_s: Array, values: Array) -> Any:
-    return interp1d(times_s, values, axis=0, kind="cubic", fill_value="extrapolate")
+    return interp1d(times_s, values, axis=0, kind="cubic", fill_value="extrapolate")  # pyright: ignore[reportArgumentType]

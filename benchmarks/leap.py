@@ -15,6 +15,7 @@ import json
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,7 +43,10 @@ def scene(urdf: Path, spheres: Path | None, massless: bool, step_s: float) -> Wo
     else:
         found = link_spheres(hand, 160)
         if spheres is not None:
-            np.savez(spheres, **{f"{k}_{n}": v for k, pair in found.items() for n, v in zip("cr", pair, strict=True)})
+            arrays: dict[str, Any] = {
+                f"{k}_{n}": v for k, pair in found.items() for n, v in zip("cr", pair, strict=True)
+            }
+            np.savez(spheres, **arrays)
     chain, links = chain_of(
         hand, found, "fixed", Servo(stiffness=STIFFNESS, damping=DAMPING, armature=ARMATURE), massless=massless
     )
@@ -102,7 +106,8 @@ def measure(
     acting = contacts(world, state, command, seconds)
     frames = torch.linspace(0, seconds, 3, dtype=torch.float64)
     kind = torch.float32 if single else torch.float64
-    world, state, frames, command = (on_device(x, device, kind) for x in (world, state, frames, command))
+    world, state = on_device(world, device, kind), on_device(state, device, kind)
+    frames, command = on_device(frames, device, kind), on_device(command, device, kind)
     driven = {world.chains[0].name: command}
     roll = rollout if lanes is None else partial(simulate_fused, lanes=lanes)
     roll(world, state, frames[:2], driven)

@@ -72,7 +72,7 @@ def scanned(folder: Path) -> Painted:
             pairs = [word.split("/") for word in words[1:4]]
             faces.append([int(pair[0]) - 1 for pair in pairs])
             corners.append([int(pair[1]) - 1 for pair in pairs])
-    texture = cv2.cvtColor(cv2.imread(str(folder / "texture_map.png")), cv2.COLOR_BGR2RGB).astype(np.float32) / 255
+    texture = np.asarray(cv2.imread(str(folder / "texture_map.png")))[..., ::-1].astype(np.float32) / 255
     height, width = texture.shape[:2]
     uv = np.array(coordinates)[np.array(corners)]
 
@@ -83,7 +83,7 @@ def scanned(folder: Path) -> Painted:
             cv2.remap(texture, columns[k : k + 8192, None], rows[k : k + 8192, None], cv2.INTER_LINEAR)[:, 0]
             for k in range(0, len(face), 8192)
         ]
-        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+        return np.concatenate([np.zeros((0, 3), np.float32), *parts], dtype=np.float32)
 
     return Painted(Mesh(np.array(vertices), np.array(faces, np.int64)), color)
 

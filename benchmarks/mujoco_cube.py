@@ -132,7 +132,7 @@ class Rival:
         # a free joint's velocity is that of the body frame's origin (world axes) and omega in body axes, as ours
         start = np.concatenate(([0.0], tosses.state[toss]))
         states, _ = mujoco.rollout.rollout(model, self._data, start[None], nstep=steps)
-        rows = states[0, STEPS_PER_FRAME - 1 :: STEPS_PER_FRAME, 1:8]
+        rows = np.asarray(states)[0, STEPS_PER_FRAME - 1 :: STEPS_PER_FRAME, 1:8]
         rows = np.concatenate((tosses.state[toss][None, :7], rows))[warm:]
         distance = np.linalg.norm(rows[:, :3] - position[warm:], axis=1)
         cosine = np.abs((rows[:, 3:] * quat[warm:]).sum(1)).clip(0, 1)

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 from zlib import crc32
 
 import numpy as np
@@ -49,7 +49,8 @@ from diagnose import base_settings
 from hidden_effects import Case, make_capture
 from store import Store, timed
 
-Stage = Literal["development", "report"]
+Stage = Literal["development", "report", "report2", "report3"]
+"""Reports are read once each."""
 Alone = Literal["throws", "slides", "drops", "rolls"]
 
 PAIRS: tuple[tuple[Kind, Alone, str, str], ...] = (
@@ -189,7 +190,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def main() -> int:
     """Measure the pairs, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--stage", choices=("development", "report"), default="development")
+    parser.add_argument("--stage", choices=get_args(Stage), default="development")
     parser.add_argument("--only", default="", help="cases whose names contain this")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")

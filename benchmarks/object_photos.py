@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 WIDTH, HEIGHT = 640, 480
 _BLUR_PX, _NOISE, _JPEG = 0.6, 2.0, 92
 _CARDS, _SIDE = 7, 512
-_BACKDROP = {"black": (0.0,) * 3, "white": (1.0,) * 3, "clutter": (0.0,) * 3}
+_BACKDROP = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "clutter": (0.0, 0.0, 0.0)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +157,8 @@ def _through_lens(image: NDArray, session: Session, how: int = cv2.INTER_LINEAR)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     bent = np.stack([x, y], -1).reshape(-1, 1, 2)
     straight = cv2.undistortPoints(bent, K, np.array([session.k1, 0, 0, 0.0]), P=K).reshape(HEIGHT, WIDTH, 2) - 0.5
-    return cv2.remap(image, *np.moveaxis(straight.astype(np.float32), -1, 0), how, borderMode=cv2.BORDER_REPLICATE)
+    x, y = np.moveaxis(straight.astype(np.float32), -1, 0)
+    return np.asarray(cv2.remap(image, x, y, how, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _developed(image: NDArray[np.float32], session: Session, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -166,7 +167,7 @@ def _developed(image: NDArray[np.float32], session: Session, rng: np.random.Gene
     noisy = 255 * bent.clip(0, 1) + rng.normal(0, _NOISE, bent.shape)
     photo = (noisy.clip(0, 255) + 0.5).astype(np.uint8)
     _, packed = cv2.imencode(".jpg", photo[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG])
-    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR)[:, :, ::-1])
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[:, :, ::-1]
 
 
 def write_photos(folder: Path, photos: list[NDArray[np.uint8]]) -> None:

@@ -16,6 +16,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from cgwm.pipeline.rendering.rasterize import Raster, rasterize
@@ -37,9 +38,12 @@ SIZES = {
 }
 WARMUP, REPEATS = 5, 30
 THRESHOLDS = (1 / 255, 1e-4)
+Scene = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Centres, scales, opacities, colours, view matrices and intrinsics."""
+Call = Callable[[Scene], tuple[Tensor, ...]]
 
 
-def scene(count: int, cameras: int, width: int, height: int, device: str, seed: int = 0) -> list[Tensor]:
+def scene(count: int, cameras: int, width: int, height: int, device: str, seed: int = 0) -> Scene:
     """Return spheres through the volume of a cube of 1 m, each some pixels wide, and cameras around it."""
     generator = torch.Generator().manual_seed(seed)
     means = torch.rand(count, 3, generator=generator) - 0.5
@@ -53,7 +57,8 @@ def scene(count: int, cameras: int, width: int, height: int, device: str, seed: 
     focal = 1.1 * height
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     tensors = (means, scales, opacities, colors, torch.stack(views), K.expand(cameras, 3, 3).contiguous())
-    return [tensor.to(device) for tensor in tensors]
+    means, scales, opacities, colors, viewmats, Ks = (tensor.to(device) for tensor in tensors)
+    return means, scales, opacities, colors, viewmats, Ks
 
 
 def median_ms(call: Callable[[], object]) -> float:
@@ -86,7 +91,7 @@ def captured_ms(call: Callable[[], object]) -> float:
     return median_ms(graph.replay)
 
 
-def peer(tensors: list[Tensor], width: int, height: int) -> tuple[Tensor, Tensor]:
+def peer(tensors: Scene, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Return gsplat's colour with depth as the fourth channel, and alpha."""
     import gsplat
 
@@ -101,9 +106,9 @@ def peer(tensors: list[Tensor], width: int, height: int) -> tuple[Tensor, Tensor
     return picture, alpha
 
 
-def both_ways(call: Callable[[list[Tensor]], tuple[Tensor, ...]], tensors: list[Tensor]) -> Callable[[], None]:
+def both_ways(call: Call, tensors: Scene) -> Callable[[], None]:
     """Return a call that renders and differentiates by centres, scales, opacities and colours."""
-    leaves = [tensor.clone().requires_grad_(k < 4) for k, tensor in enumerate(tensors)]
+    leaves: Any = [tensor.clone().requires_grad_(k < 4) for k, tensor in enumerate(tensors)]
     grads: list[Tensor] = []
 
     def run() -> None:
@@ -121,7 +126,7 @@ def measure(size: tuple[int, int, int, int], with_peer: bool) -> dict[str, objec
     count, cameras, width, height = size
     tensors = scene(count, cameras, width, height, "cuda")
     row: dict[str, object] = {"spheres": count, "cameras": cameras, "size": f"{width}x{height}"}
-    others: list[tuple[str, Callable[[list[Tensor]], tuple[Tensor, ...]]]] = []
+    others: list[tuple[str, Call]] = []
     if with_peer:
         others.append(("gsplat", lambda tensors: peer(tensors, width, height)))
     pairs = int(rasterize(*tensors, Raster(width, height, *THRESHOLDS))[4])
@@ -144,7 +149,9 @@ def measure(size: tuple[int, int, int, int], with_peer: bool) -> dict[str, objec
 
 def cpu() -> dict[str, object]:
     """Return the time of the torch twin: 2,000 spheres at 200x200, forward and backward."""
-    tensors = [tensor.requires_grad_(k < 4) for k, tensor in enumerate(scene(2000, 1, 200, 200, "cpu"))]
+    tensors = scene(2000, 1, 200, 200, "cpu")
+    for leaf in tensors[:4]:
+        leaf.requires_grad_(True)
     times = []
     for _ in range(8):
         began = time.perf_counter()

@@ -68,7 +68,7 @@ class FittedCgwm:
         file = self.model.file
         if file.contact is None:
             raise UsageError("the model has no fitted physics.")
-        change = {"contact": file.contact.model_copy(update={"friction": ground})}
+        change: dict[str, Any] = {"contact": file.contact.model_copy(update={"friction": ground})}
         if fingertip is not None:
             change["pairs"] = tuple(pair.model_copy(update={"friction": fingertip}) for pair in file.pairs)
         return replace(self, model=replace(self.model, file=file.model_copy(update=change)))

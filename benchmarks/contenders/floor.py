@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
@@ -29,7 +29,7 @@ from .training import rolled_out
 class Floor:
     """The truth in our engine."""
 
-    name: ClassVar[str] = "floor"
+    name: str = "floor"
 
     def fit(self, cell: Cell, budget_s: float | None) -> FittedFloor:
         """Read the truth and fill the true mesh with spheres."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from cgwm.datasets.capture.capture import Capture
-from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.datasets.models.model import Model, read_model
 from cgwm.pipeline.phys_geo.images.coarse_spheres import coarse_model
 from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
@@ -137,7 +137,7 @@ def observed(training: Training, found: PoseTrack) -> Found:
     position, quat = found.position_m.cpu().numpy(), found.quat_wxyz.cpu().numpy()
     tracks = {world.bodies[k].name: Track(times, position[:, k], quat[:, k]) for k in world.free}
     window = (float(times[0]) - 1e-9, float(times[-1]) + 1e-9)
-    observations = Observations.of(world, [(TRAIN_EPISODE, tracks | training.drives)], [window])
+    observations = Observations.of(world, [Episode(TRAIN_EPISODE, tracks | training.drives)], [window])
     seen = found.found.cpu().to(observations.seen)[None, :, None].expand_as(observations.seen)
     observations = replace(observations, seen=seen.clone(), has_orientation=seen.clone())
     observations = replace(observations, state=first_state(world, observations))  # of what was seen alone
@@ -172,7 +172,7 @@ def checked(position_m: Array, quat_wxyz: Array) -> Prediction:
     """
     finite = np.isfinite(position_m).all((1, 2)) & np.isfinite(quat_wxyz).all((1, 2))
     if not finite.all():
-        raise NotConvergedError(f"the prediction diverges at frame {int(np.argmin(finite))} of {len(finite)}.")
+        raise NotConvergedError(f"the prediction diverges at frame {int(np.argmin(finite))} of {finite.size}.")
     return Prediction(position_m, quat_wxyz)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
@@ -20,7 +20,7 @@ from .training import rolled_out
 class Frozen:
     """Whatever the free bodies do, they stay where they start."""
 
-    name: ClassVar[str] = "frozen"
+    name: str = "frozen"
 
     def fit(self, cell: Cell, budget_s: float | None) -> FittedZero:
         """Read the model; there is nothing to learn."""
@@ -31,7 +31,7 @@ class Frozen:
 class Ballistic:
     """The free bodies fly on through everything, by rigid-body dynamics without contact."""
 
-    name: ClassVar[str] = "ballistic"
+    name: str = "ballistic"
 
     def fit(self, cell: Cell, budget_s: float | None) -> FittedZero:
         """Read the model; there is nothing to learn."""

@@ -152,13 +152,13 @@ def smooth(errors: Errors, values: Array, rate_hz: float) -> Array:
     if errors.cutoff_hz:
         coefficients: Any = butter(2, errors.cutoff_hz, fs=rate_hz)
         b, a = coefficients
-        return np.asarray(filtfilt(b, a, values, axis=0))
+        return np.asarray(filtfilt(b, a, values, axis=0), float)
     return values
 
 
 def _root(times_s: Array, scale_s: float, kind: str) -> Array:
     """Return a root (T, T) of the correlation of slow errors."""
-    return np.asarray(np.linalg.cholesky(slow_correlation(times_s, scale_s, kind) + 1e-9 * np.eye(len(times_s))))
+    return np.asarray(np.linalg.cholesky(slow_correlation(times_s, scale_s, kind) + 1e-9 * np.eye(len(times_s))), float)
 
 
 def slow_correlation(times_s: Array, scale_s: float, kind: str) -> Array:

@@ -35,7 +35,7 @@ class Own:
     ) -> Motion:
         """See `Engine`."""
         world = self._world()
-        times = np.arange(round((end - start) * STEPS_PER_S) + 1) * STEP_S
+        times = np.arange(round((end - start) * STEPS_PER_S) + 1, dtype=float) * STEP_S
         drives = {}
         if command is not None:
             drives = {FINGERTIP: Track(times, command[0][: len(times)], np.tile([1.0, 0, 0, 0], (len(times), 1)))}
