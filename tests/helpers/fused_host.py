@@ -38,7 +38,8 @@ struct Fibres {  // the threads of a warp
     bool begun[32];
     double slots[2][32];
     const void* places[2][32];
-    long exchanges[32];
+    long exchanges[32], waits[32];
+    const void* waits_at[32];
     bool done[32];
     int count, current;
 };
@@ -53,19 +54,46 @@ static void next_fibre() {
     setcontext(&fibres.contexts[fibres.current]);  // asks the system for its signals, which a jump does not
 }
 
+static void part_ways() {
+    fprintf(stderr, "lanes part ways\n");
+    abort();
+}
+
+// Lets the other lanes of a set run until they came to a place as often as this one.
+static void await(unsigned others, const long* times) {
+    int lane = fibres.current;
+    for (int round = 0; round < 1000; round++) {
+        bool all = true;
+        for (int other = 0; other < fibres.count; other++) {
+            bool missing = (others >> other & 1) && times[other] < times[lane];
+            if (missing && fibres.done[other]) part_ways();
+            all = all && !missing;
+        }
+        if (all) return;
+        next_fibre();
+    }
+    part_ways();
+}
+
 static const double* exchange(double mine, const void* place) {
     int lane = fibres.current, turn = fibres.exchanges[lane]++ % 2;
     fibres.slots[turn][lane] = mine;
     fibres.places[turn][lane] = place;
-    next_fibre();
+    await(0xffffffffu, fibres.exchanges);
     for (int other = 0; other < fibres.count; other++) {
-        long ahead = fibres.exchanges[other] - fibres.exchanges[lane];
-        if (ahead < 0 || ahead > 1 || fibres.places[turn][other] != place) {
-            fprintf(stderr, "lanes part ways\n");
-            abort();
-        }
+        if (fibres.exchanges[other] > fibres.exchanges[lane] + 1 || fibres.places[turn][other] != place) part_ways();
     }
     return fibres.slots[turn];
+}
+__attribute__((noinline)) static void __syncwarp(unsigned peers) {
+    int lane = fibres.current;
+    fibres.waits[lane]++;
+    fibres.waits_at[lane] = __builtin_return_address(0);
+    await(peers, fibres.waits);
+    for (int other = 0; other < fibres.count; other++) {
+        bool here = (peers >> other & 1) && fibres.waits[other] == fibres.waits[lane];
+        if (here && fibres.waits_at[other] != fibres.waits_at[lane]) part_ways();
+    }
 }
 #define PLACE __builtin_return_address(0)
 template <class T> __attribute__((noinline)) T __shfl_xor_sync(unsigned, T mine, int apart, int) {
@@ -89,9 +117,17 @@ static int first_environment;
 
 static void lane_main() {
     Lanes lanes = {fibres.current % LANES, false};
-    roll(*shared_problem, first_environment + fibres.current / LANES, lanes);
+#if SHARED
+    static Environment environments[32 / LANES];
+    Environment& env = environments[fibres.current / LANES];
+#else
+    Environment env;
+#endif
+    roll(*shared_problem, first_environment + fibres.current / LANES, lanes, env);
     fibres.done[fibres.current] = true;
-    if (fibres.current + 1 < fibres.count) next_fibre();  // the others end one after the other
+    for (int other = 0; other < fibres.count; other++) {
+        while (!fibres.done[other]) next_fibre();
+    }
     setcontext(&fibres.home);
 }
 
@@ -100,7 +136,8 @@ extern "C" void run(PARAMETERS) {
 #if LANES == 1
     for (int index = 0; index < environments; index++) {
         Lanes lanes = {0, false};
-        roll(problem, index, lanes);
+        Environment env;
+        roll(problem, index, lanes, env);
     }
 #else
     for (int first = 0; first < environments; first += 32 / LANES) {
@@ -110,7 +147,7 @@ extern "C" void run(PARAMETERS) {
         fibres.count = environments - first < 32 / LANES ? (environments - first) * LANES : 32;
         fibres.current = 0;
         for (int lane = 0; lane < fibres.count; lane++) {
-            fibres.exchanges[lane] = 0;
+            fibres.exchanges[lane] = fibres.waits[lane] = 0;
             fibres.done[lane] = false;
             fibres.begun[lane] = lane == 0;
             getcontext(&fibres.contexts[lane]);

@@ -103,8 +103,8 @@ def roll(
     batch, count, bodies = packed.table.shape[0], times_s.shape[-1], len(world.bodies)
     structure = packed.structure
     shape = (structure.contacts, batch, structure.single, dual, structure.paired)
-    chosen = lanes or lanes_for(*shape, chained=structure.tree is not None)
-    structure = replace(structure, dual=dual, lanes=chosen)
+    chosen = lanes or lanes_for(*shape, links=0 if structure.tree is None else len(structure.tree.bodies))
+    structure = replace(structure, dual=dual).on_lanes(chosen)
     frames = values[0].new_empty(batch, count, bodies, FRAME_WIDTH)
     frame_tangents = torch.empty_like(frames) if dual else None
     labels = values[0].new_empty(batch, count, structure.contacts, _LABEL_WIDTH) if record_contacts else None

@@ -118,7 +118,7 @@ class _Resident:
         kind, bodies, cuda = packed.structure, len(packed.structure.free), packed.table.is_cuda
         if lanes is None:
             lanes = lanes_for(kind.contacts, 1, kind.single, kind.dual, kind.paired) if cuda else 1
-        structure = replace(kind, lanes=lanes, carried=True)
+        structure = replace(kind, carried=True).on_lanes(lanes)
         arrays = {
             name: getattr(packed, name).contiguous() for name in ("table", "steps", "geometry", "surfaces", "drives")
         }
@@ -128,5 +128,5 @@ class _Resident:
             turn=None if packed.turn is None else packed.turn.cpu(),
             sent=torch.empty(drives.shape, dtype=drives.dtype, pin_memory=cuda and drives.numel() > 0),
             frames=drives.new_empty(1, 2, bodies, FRAME_WIDTH),
-            carried=drives.new_zeros(1, lanes, structure.carried_width),
+            carried=drives.new_zeros(1, structure.lanes, structure.carried_width),
         )

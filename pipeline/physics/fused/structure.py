@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ...runtime import kernel_build
 from ..contact_detection import FAR_M, PAIR_SMOOTHING_M
@@ -24,13 +24,15 @@ TURN_COLUMNS, WORLD_COLUMNS = 4, 5
 contact law adds one to those of the world."""
 MOTION_COLUMNS = 13
 """Last columns of a body: position, orientation, velocity and spin."""
+SHARED_BYTES = 48 * 1024
+"""Shared memory that a block of any CUDA device may have without asking for more."""
 _LONG_LIST = 8
 """Number of constants from which a list is an array in memory, and not a chain of comparisons."""
 _BUSY_THREADS = 262_144
 """Number of threads that fill an H200; more environments get fewer threads each."""
-_BUSY_CHAINED = 16_384
-"""The same where links move, whose motion each thread of an environment computes: measured on an H100 with 4,096 hands,
-where 4 threads each are the fastest.
+_BUSY_CHAINED, _MOST_SPARSE = 16_384, 8
+"""The same where links move, and the most threads that an environment has with more than these: measured on an H100,
+where 4,096 hands are the fastest with 8 threads each, and 128 hands with 32.
 """
 _FREE_SLOTS = {(True, False): 8, (False, False): 4, (True, True): 2, (False, True): 1}
 """Number of contacts that fit into the registers of a thread, by (single precision, with derivatives)."""
@@ -138,6 +140,42 @@ class Structure:
         return max(self.laws, default=0) + 1
 
     @property
+    def shared(self) -> bool:
+        """Whether the threads of an environment share one copy of what they have in common, and divide the work on it.
+
+        Where links move, most of a step is such work; the state of one body alone fits into the registers of each.
+        """
+        return self.tree is not None and self.lanes > 1
+
+    @property
+    def shared_bytes(self) -> int:
+        """Bound on the size of the copy that the threads of an environment share, `Environment` in `kernels`."""
+        tree, bodies, laws, free = self.tree or Tree(), len(self.free), self.law_count, max(1, sum(self.free))
+        links, joints, dofs, depth = len(tree.bodies), len(tree.joint_dofs) + 1, len(tree.dof_above), tree.depth
+        numbers = 32 + 5 * laws + 52 * bodies + 9 * free + 5 * len(self.pairs) + 6 * len(tree.roots) + 6 * depth
+        numbers += 23 * links + 16 * joints + (8 + depth) * dofs + max(13 * links, 6 * bodies + 10 * self.lanes)
+        numbers += max(33 * tree.heavy * links, 6 * depth * links + 6 * (links + free))
+        size = (4 if self.single else 8) * (2 if self.dual else 1)
+        flags = 2 * len(self.pairs) + 5 * links + joints + 4 * len(tree.roots) + 4 * free
+        return size * numbers + 8 * self.lanes + 28 * bodies + flags + 64
+
+    @property
+    def block_bytes(self) -> int:
+        """Bound on the shared memory of a block of threads."""
+        return self.shared_bytes * (THREADS // self.lanes) + (self.tree or Tree()).list_bytes + 64
+
+    def on_lanes(self, lanes: int) -> Structure:
+        """Return the structure for a number of threads per environment, or for those that shared memory has room for.
+
+        Fewer environments share a block where their copies are large; where not even one fits, each environment has
+        one thread, whose copy is in its own memory.
+        """
+        wanted = replace(self, lanes=lanes)
+        if not wanted.shared or wanted.block_bytes <= SHARED_BYTES:
+            return wanted
+        return self.on_lanes(2 * lanes if lanes < THREADS else 1)
+
+    @property
     def slots(self) -> int:
         """Number of contacts per thread."""
         return max(1, -(-self.contacts // self.lanes))
@@ -174,24 +212,27 @@ class Structure:
         flags = [f"#define {name} {int(value)}" for name, value in (self._flags(host) | _tree_flags(tree)).items()]
         numbers = [f"#define {name} {value!r}" for name, value in _NUMBERS.items()]
         functions = [_function(name, values) for name, values in (self._lists() | self._tree_lists(tree)).items()]
-        texts = (kernel_file("language"), *functions, *tree.lists(), *map(kernel_file, _FILES))
+        texts = (kernel_file("language"), *functions, *tree.lists(self.shared and not host), *map(kernel_file, _FILES))
         return "\n".join((*flags, *numbers, *texts))
 
     def _flags(self, host: bool) -> dict[str, int]:
         """Return the constants by name, those of chains aside."""
         paired = self.paired
         alone = host and self.lanes == 1  # one thread of a CPU, whose arrays lie in its cache
+        hulls = paired and any(faces for _, faces, *_ in self.hulls)
         held = not paired and (alone or self._fits_registers)
         return {
-            "HOST": host, "SINGLE": self.single, "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
+            "HOST": host, "SHARED": self.shared, "SHARED_BYTES": self.shared_bytes, "SINGLE": self.single,
+            "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
             "RECORD": self.record, "EFFECTS": self.effects, "MAGNETS": self.magnets,
             "TWISTED": self.twisted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic, "TURNED": self.turned,
-            "BODIES": len(self.free), "PAIRS": len(self.pairs), "FIXED": len(self.surfaces),
+            "BODIES": len(self.free), "FREES": max(1, sum(self.free)) if self.shared else len(self.free),
+            "PAIRS": len(self.pairs), "FIXED": len(self.surfaces),
             "MESHES": self.surfaces.count(MESH), "MESH_CONTACTS": MESH_CONTACTS,
             "HALF_SPACE_KIND": HALF_SPACE, "BOX_KIND": BOX, "MESH_KIND": MESH,
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
             "LISTED": paired or alone, "CULLED": alone, "LAWS": self.law_count, "STEP_WIDTH": 2 + 2 * self.law_count,
-            "HULLS": paired and any(faces for _, faces, *_ in self.hulls),
+            "HULLS": hulls, "QUEUED": self.shared and not hulls,
             "PATCHES": bool(self.areas),
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
@@ -200,7 +241,8 @@ class Structure:
     def _lists(self) -> dict[str, Iterable[int]]:
         """Return the lists by name."""
         lists: dict[str, Iterable[int]] = {
-            "is_free": self.free, "drive_number": self.drives, "sphere_count": self.spheres,
+            "is_free": self.free, "free_number": [sum(self.free[:index]) for index in range(len(self.free))],
+            "drive_number": self.drives, "sphere_count": self.spheres,
             "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
             "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
             "contact_start": _starts([count for _, _, count in self.pairs]),
@@ -223,7 +265,8 @@ def _tree_flags(tree: Tree) -> dict[str, int]:
     """Return the constants of chains by name."""
     return {
         "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
-        "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy,
+        "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy, "LEVELS": tree.levels,
+        "BRANCH_COUNT": len(tree.branches),
     }  # fmt: skip
 
 
@@ -232,10 +275,11 @@ def kernel_file(name: str) -> str:
     return "\n" + kernel_build.source_file(__name__, f"kernels/{name}.cuh")
 
 
-def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool, chained: bool = False) -> int:
+def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool, links: int = 0) -> int:
     """Return the number of threads that should share an environment, a power of two up to 32."""
-    if chained:
-        wanted = min(contacts, _BUSY_CHAINED // max(1, environments))
+    if links > 0:
+        # half of the links at once: fewer threads would do them one after another
+        wanted = max(min(links // 2, _MOST_SPARSE), min(contacts, _BUSY_CHAINED // max(1, environments)))
     else:
         wanted = min(contacts, 32) if paired else min(contacts, _BUSY_THREADS // max(1, environments))
         wanted = max(wanted, -(-contacts // _FREE_SLOTS[single, dual]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -67,6 +68,19 @@ class Tree:
         """Number of columns."""
         return LINK_COLUMNS * len(self.bodies) + JOINT_COLUMNS * len(self.joint_dofs)
 
+    @property
+    def levels(self) -> int:
+        """Number of links from a root to the farthest leaf."""
+        return 1 + max((self._level(link) for link in range(len(self.bodies))), default=0)
+
+    @property
+    def branches(self) -> list[list[int]]:
+        """Moving joints by branch: those of two branches have no coordinate above them in common."""
+        found: dict[int, list[int]] = {}
+        for joint, dof in enumerate(self.joint_dofs):
+            found.setdefault(self.dof_above[dof][0], []).append(joint)
+        return list(found.values())
+
     def groups(self, free: Sequence[bool]) -> list[int]:
         """Return for each body the one under which its contacts count: a chain's root; -1 where it cannot move."""
         found = [index if moves else -1 for index, moves in enumerate(free)]
@@ -78,27 +92,76 @@ class Tree:
     def _root(self, link: int) -> int:
         return link if self.parents[link] < 0 else self._root(self.parents[link])
 
-    def lists(self) -> list[str]:
-        """Return the source of the lists of constants."""
+    def _level(self, link: int) -> int:
+        return 0 if self.parents[link] < 0 else 1 + self._level(self.parents[link])
+
+    def _rows(self) -> dict[str, tuple[str, list[list[int]]]]:
+        """Return rows of numbers by the name of the list of their starts, each with the name of the list of them all.
+
+        Links by level, children of each link from the last to the first, coordinates by the number of those above,
+        coordinates below each one, and moving joints by branch.
+        """
+        links, dofs = range(len(self.bodies)), range(len(self.dof_links))
+        levels = [[k for k in links if self._level(k) == level] for level in range(self.levels)]
+        children = [[k for k in reversed(links) if self.parents[k] == link] for link in links]
+        ranks = [[k for k in dofs if len(self.dof_above[k]) == rank + 1] for rank in range(self.depth)]
+        below = [[k for k in dofs if k != dof and dof in self.dof_above[k]] for dof in dofs]
+        return {
+            "level_start": ("level_link", levels), "child_start": ("link_child", children),
+            "rank_start": ("rank_dof", ranks), "below_start": ("dof_below", below),
+            "branch_start": ("branch_joint", self.branches),
+        }  # fmt: skip
+
+    @property
+    def list_bytes(self) -> int:
+        """Size of the lists of constants where each block of threads has a copy."""
+        return 2 * sum(max(1, len(values)) for values in self._lists().values())
+
+    def lists(self, copied: bool) -> list[str]:
+        """Return the source of the lists of constants, and of their copies in the memory of a block of threads.
+
+        Args:
+            copied: Whether the names are those of the copies, which `copy_lists` makes: on a GPU, where one place of a
+                list gives the next one's, the memory of a block answers sooner.
+        """
         if not self.bodies:
             return []
+        lists = {name: list(values) or [0] for name, values in self._lists().items()}
+        kind, ending = ("short", "_list") if copied else ("int", "")
+        sources = [
+            f"__device__ static const {kind} {name}{ending}[] = {{{', '.join(map(str, values))}}};"
+            for name, values in lists.items()
+        ]
+        if not copied:
+            return sources
+        sources += [f"__shared__ static short {name}[{len(values)}];" for name, values in lists.items()]
+        copies = [
+            f"    KEEP_LOOP for (int i = threadIdx.x; i < {len(values)}; i += THREADS) {name}[i] = {name}_list[i];"
+            for name, values in lists.items()
+        ]
+        return [*sources, "INLINE void copy_lists() {", *copies, "    __syncwarp(0xffffffffu);", "}"]
+
+    def _lists(self) -> dict[str, Sequence[int]]:
+        """Return the lists of constants by name."""
         depth = self.depth
         padded = {
             name: [k for row in rows for k in (*row, *[0] * (depth - len(row)))]
             for name, rows in (("link_above", self.above), ("dof_above", self.dof_above))
         }
-        lists = {
+        lists: dict[str, Sequence[int]] = {
             "link_body": self.bodies, "link_parent": self.parents, "link_kind": self.kinds, "link_dof": self.dofs,
             "link_joint": self.joints, "link_depth": [len(row) for row in self.above],
             "link_root": [self._root(link) for link in range(len(self.bodies))], "dof_link": self.dof_links,
             "link_light": self.light,
             "dof_depth": [len(row) for row in self.dof_above], "joint_dof": self.joint_dofs, "chain_root": self.roots,
             "chain_joint": self.firsts, "chain_joints": self.counts, "chain_command": self.commands, **padded,
+            "link_chain": [self.roots.index(self._root(link)) for link in range(len(self.bodies))],
+            "joint_chain": [chain for chain, count in enumerate(self.counts) for _ in range(count)],
         }  # fmt: skip
-        return [
-            f"__device__ static const int {name}[] = {{{', '.join(map(str, values)) or '0'}}};"
-            for name, values in lists.items()
-        ]
+        for start, (name, rows) in self._rows().items():
+            lists[start] = [0, *accumulate(map(len, rows))]
+            lists[name] = [number for row in rows for number in row]
+        return lists
 
 
 def tree_of(world: World, drives: int, commanded: Sequence[int]) -> Tree:

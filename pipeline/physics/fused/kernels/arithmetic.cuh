@@ -225,12 +225,20 @@ __device__ inline void write_row(Number* to, Number a, Number b, Number c, Numbe
     *reinterpret_cast<AlignedRow*>(to) = row;
 }
 
-// The LANES neighbouring threads that simulate one environment; all of them hold the same state. At every exchange
-// between threads the whole warp takes part, even if only some of its environments need it: in a divergent warp an
-// exchange takes ten times as long.
+// The LANES neighbouring threads that simulate one environment; all of them hold the same state, or share one copy of
+// it (SHARED). At every exchange between threads the whole warp takes part, even if only some of its environments need
+// it: in a divergent warp an exchange takes ten times as long.
 struct Lanes {
     int lane;
-    bool idle;  // surplus lanes without an environment, which must not write
+    bool idle;  // surplus lanes without an environment, which must not write results
+    // Whether this lane writes what there is one copy of.
+    __device__ bool writes() const { return !SHARED || lane == 0; }
+    // Waits for the other lanes, whose writes into the one copy then are there. The whole warp takes part here, too.
+    __device__ void sync() const {
+#if SHARED
+        __syncwarp(FULL);
+#endif
+    }
     // Whether the condition holds in any environment of the warp; with LANES = 1, without exchanges, in this one.
     __device__ bool any(bool mine) const {
 #if LANES == 1
@@ -289,3 +297,16 @@ struct Lanes {
     }
     __device__ Vec sum(Vec mine) const { return vec(sum(mine.x), sum(mine.y), sum(mine.z)); }
 };
+
+// The contacts of a pair that belong to a lane, `k` counts from its first one: every LANES-th. Where those of a body that
+// is a grid of spheres wait in a queue, the order of the lanes changes from group to group, or few lanes had all those
+// of one side.
+#if QUEUED
+__device__ inline int owned(const Lanes& lanes, int group) { return group * LANES + (lanes.lane + group) % LANES; }
+#define EACH_OWNED(lanes, start, count, k)                                                    \
+    KEEP_LOOP for (int group = (start) / LANES, k; group * LANES < (start) + (count); group++) \
+        if ((k = owned(lanes, group) - (start)) >= 0 && k < (count))
+#else
+#define EACH_OWNED(lanes, start, count, k) \
+    for (int k = ((lanes).lane - (start) % LANES + LANES) % LANES; k < (count); k += LANES)
+#endif

@@ -5,23 +5,29 @@ INLINE Vec rotated(Quat q, Vec v) {
 }
 
 // Poses of the links of all chains from those of the roots and the joints' values.
-INLINE void place_links(const Chain& chain, const Real* values, Vec* positions, Quat* quats) {
-    for (int l = 0; l < LINKS; l++) {
-        int parent = link_parent[l], kind = link_kind[l];
-        if (parent < 0) continue;
+INLINE void place_links(const Chain& chain, const Lanes& lanes, const Real* values, Vec* positions, Quat* quats) {
+    DIVIDED(lanes, l, LINKS) {  // each in its parent's frame
+        int kind = link_kind[l];
+        if (link_parent[l] < 0) continue;
         const Joint& j = chain.joints[l];
-        Vec offset = j.position;
-        Quat turn = j.quat;
-        if (kind == 2) turn = multiply(turn, quat_exp(values[link_joint[l]] * j.axis));
-        if (kind == 3) offset = offset + rotated(turn, values[link_joint[l]] * j.axis);
-        positions[l] = positions[parent] + rotated(quats[parent], offset);
-        quats[l] = multiply(quats[parent], turn);
+        positions[l] = j.position;
+        quats[l] = j.quat;
+        if (kind == 2) quats[l] = multiply(j.quat, quat_exp(values[link_joint[l]] * j.axis));
+        if (kind == 3) positions[l] = positions[l] + rotated(j.quat, values[link_joint[l]] * j.axis);
+    }
+    lanes.sync();
+    DOWN_LINKS(lanes, l) {
+        int parent = link_parent[l];
+        if (parent < 0) continue;
+        positions[l] = positions[parent] + rotated(quats[parent], positions[l]);
+        quats[l] = multiply(quats[parent], quats[l]);
     }
 }
 
 // Velocities of the links from those of the roots and the joints' speeds.
-INLINE void move_links(const Vec* axes, const Vec* positions, const Real* speeds, Vec* linear, Vec* angular) {
-    for (int l = 0; l < LINKS; l++) {
+INLINE void move_links(const Lanes& lanes, const Vec* axes, const Vec* positions, const Real* speeds, Vec* linear,
+                       Vec* angular) {
+    DOWN_LINKS(lanes, l) {
         int parent = link_parent[l], kind = link_kind[l];
         if (parent < 0) continue;
         linear[l] = linear[parent] + cross(angular[parent], positions[l] - positions[parent]);
@@ -31,21 +37,8 @@ INLINE void move_links(const Vec* axes, const Vec* positions, const Real* speeds
     }
 }
 
-struct Spatial {  // angular and linear part, about the root's origin
-    Vec turning, moving;
-};
 INLINE Real along(const Spatial& a, const Spatial& b) { return dot(a.turning, b.turning) + dot(a.moving, b.moving); }
 INLINE Vec unit_vector(int k) { return vec(Real(k == 0 ? 1 : 0), Real(k == 1 ? 1 : 0), Real(k == 2 ? 1 : 0)); }
-
-// A configuration of all chains: world axes, each chain about its root's origin.
-struct Configuration {
-    Vec origins[LINKS];
-    Spatial joints[LINKS];
-#if HEAVY
-    Vec coms[LINKS];
-    Sym inertias[LINKS];
-#endif
-};
 
 INLINE Spatial column_of(const Configuration& at, int dof) {
     int link = dof_link[dof];
@@ -55,20 +48,22 @@ INLINE Spatial column_of(const Configuration& at, int dof) {
     return k < 3 ? linear : angular;
 }
 
-INLINE void configure(const Chain& chain, const Vec* positions, const Quat* quats, Configuration& at) {
-    for (int l = 0; l < LINKS; l++) {
+INLINE void configure(const Chain& chain, const Lanes& lanes, const Vec* positions, const Quat* quats,
+                      Configuration& at) {
+    DIVIDED(lanes, l, LINKS) {
         const Joint& j = chain.joints[l];
-        at.origins[l] = positions[l] - positions[link_root[l]];
+        Vec origin = positions[l] - positions[link_root[l]];
         Mat R = matrix(quats[l]);
         Vec axis = R * j.axis;
-        Spatial turning = {axis, cross(at.origins[l], axis)}, moving = {none(), axis};
+        Spatial turning = {axis, cross(origin, axis)}, moving = {none(), axis};
         at.joints[l] = link_kind[l] == 2 ? turning : moving;
 #if HEAVY
         if (link_light[l]) continue;
-        at.coms[l] = at.origins[l] + R * j.com;
+        at.coms[l] = origin + R * j.com;
         at.inertias[l] = turned(R, j.inertia);
 #endif
     }
+    lanes.sync();
 }
 
 #if HEAVY
@@ -80,11 +75,11 @@ INLINE Spatial momentum(const Chain& chain, const Configuration& at, int l, cons
 
 // Adds the mass matrix to A, by composite bodies: mass, first moment and inertia of each link and all that it carries,
 // about the root's origin.
-INLINE void add_mass(const Chain& chain, const Configuration& at, Real* A) {
-    Real mass[LINKS];
-    Vec moment[LINKS];
-    Sym inertia[LINKS];
-    for (int l = 0; l < LINKS; l++) {
+INLINE void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, Real* A) {
+    ROOM(Real, mass, LINKS, chain.before.mass);
+    ROOM(Vec, moment, LINKS, chain.before.mass);
+    ROOM(Sym, inertia, LINKS, chain.before.mass);
+    DIVIDED(lanes, l, LINKS) {
         if (link_light[l]) continue;
         Vec c = at.coms[l];
         mass[l] = chain.joints[l].mass;
@@ -96,26 +91,31 @@ INLINE void add_mass(const Chain& chain, const Configuration& at, Real* A) {
                      S.yz - m * c.y * c.z};
         inertia[l] = about;
     }
-    for (int l = LINKS - 1; l >= 0; l--) {
-        int parent = link_parent[l];
-        if (parent < 0 || link_light[l]) continue;
-        mass[parent] += mass[l];
-        moment[parent] = moment[parent] + moment[l];
-        Sym &to = inertia[parent], from = inertia[l];
-        to.xx += from.xx;
-        to.yy += from.yy;
-        to.zz += from.zz;
-        to.xy += from.xy;
-        to.xz += from.xz;
-        to.yz += from.yz;
+    lanes.sync();
+    UP_LINKS(lanes, parent) {
+        Sym& to = inertia[parent];
+        INNER for (int i = child_start[parent]; i < child_start[parent + 1]; i++) {
+            int l = link_child[i];
+            if (link_light[l]) continue;
+            mass[parent] += mass[l];
+            moment[parent] = moment[parent] + moment[l];
+            Sym from = inertia[l];
+            to.xx += from.xx;
+            to.yy += from.yy;
+            to.zz += from.zz;
+            to.xy += from.xy;
+            to.xz += from.xz;
+            to.yz += from.yz;
+        }
     }
-    for (int d = 0; d < DOFS; d++) {
+    DIVIDED(lanes, d, DOFS) {
         int l = dof_link[d];
         Spatial S = column_of(at, d);
         Spatial F = {inertia[l] * S.turning + cross(moment[l], S.moving),
                      mass[l] * S.moving + cross(S.turning, moment[l])};
-        for (int k = 0; k < dof_depth[d]; k++) A[d * DEPTH + k] += along(column_of(at, dof_above[d * DEPTH + k]), F);
+        INNER for (int k = 0; k < dof_depth[d]; k++) A[d * DEPTH + k] += along(column_of(at, dof_above[d * DEPTH + k]), F);
     }
+    lanes.sync();
 }
 
 #if EFFECTS
@@ -135,12 +135,13 @@ INLINE Spatial pushed(const Wrenches& w, const Chain& chain, const Configuration
 
 // Forces that keep the generalised velocity: Coriolis, centrifugal, against gravity, and against effects; recursive
 // Newton-Euler.
-INLINE void bias_of(const Environment& env, const Configuration& at, const Vec* root_linear, const Vec* root_angular,
-                    const Vec* root_lift, const Vec* root_twist, const Real* speed, Real* bias) {
-    const Chain& chain = env.chain;
-    Spatial velocity[LINKS], change[LINKS], force[LINKS];
-    for (int d = 0; d < DOFS; d++) bias[d] = Real(0);
-    for (int l = 0; l < LINKS; l++) {
+INLINE void bias_of(Environment& env, const Lanes& lanes, const Configuration& at, const Vec* root_linear,
+                    const Vec* root_angular, const Vec* root_lift, const Vec* root_twist, const Real* speed, Real* bias) {
+    Chain& chain = env.chain;
+    ROOM(Spatial, velocity, LINKS, chain.before.force);
+    ROOM(Spatial, change, LINKS, chain.before.force);
+    ROOM(Spatial, force_on, LINKS, chain.before.force);
+    DOWN_LINKS(lanes, l) {
         int parent = link_parent[l], dof = link_dof[l];
         if (link_light[l]) continue;
         if (parent < 0) {
@@ -149,7 +150,7 @@ INLINE void bias_of(const Environment& env, const Configuration& at, const Vec* 
                 v = vec(speed[dof], speed[dof + 1], speed[dof + 2]);
                 w = vec(speed[dof + 3], speed[dof + 4], speed[dof + 5]);
             }
-            Spatial V = {w, v}, A = {root_twist[l], root_lift[l] - cross(w, v)};
+            Spatial V = {w, v}, A = {root_twist[link_chain[l]], root_lift[link_chain[l]] - cross(w, v)};
             velocity[l] = V;
             change[l] = A;
         } else {
@@ -164,28 +165,35 @@ INLINE void bias_of(const Environment& env, const Configuration& at, const Vec* 
                 velocity[l].moving = velocity[l].moving + moving;
             }
         }
+    }
+    DIVIDED(lanes, l, LINKS) {
+        if (link_light[l]) continue;
         Spatial P = momentum(chain, at, l, velocity[l]), F = momentum(chain, at, l, change[l]);
         Vec w = velocity[l].turning, v = velocity[l].moving;
-        force[l].turning = F.turning + cross(w, P.turning) + cross(v, P.moving);
-        force[l].moving = F.moving + cross(w, P.moving);
+        force_on[l].turning = F.turning + cross(w, P.turning) + cross(v, P.moving);
+        force_on[l].moving = F.moving + cross(w, P.moving);
 #if EFFECTS
         Spatial push = pushed(env.wrenches, chain, at, l, velocity[l]);
-        force[l].turning = force[l].turning - push.turning;
-        force[l].moving = force[l].moving - push.moving;
+        force_on[l].turning = force_on[l].turning - push.turning;
+        force_on[l].moving = force_on[l].moving - push.moving;
 #endif
     }
-    for (int l = LINKS - 1; l >= 0; l--) {
-        int parent = link_parent[l], dof = link_dof[l];
+    lanes.sync();
+    UP_LINKS(lanes, l) {
+        int dof = link_dof[l];
         if (link_light[l]) continue;
-        if (dof >= 0 && link_kind[l] != 1) bias[dof] = along(at.joints[l], force[l]);
-        if (link_kind[l] == 1) {
-            Vec f = force[l].moving, n = force[l].turning;
-            Real numbers[6] = {f.x, f.y, f.z, n.x, n.y, n.z};
-            for (int k = 0; k < 6; k++) bias[dof + k] = numbers[k];
+        Spatial& all = force_on[l];
+        INNER for (int i = child_start[l]; i < child_start[l + 1]; i++) {
+            if (link_light[link_child[i]]) continue;
+            const Spatial& carried = force_on[link_child[i]];
+            all.turning = all.turning + carried.turning;
+            all.moving = all.moving + carried.moving;
         }
-        if (parent >= 0) {
-            force[parent].turning = force[parent].turning + force[l].turning;
-            force[parent].moving = force[parent].moving + force[l].moving;
+        if (dof >= 0 && link_kind[l] != 1) bias[dof] = along(at.joints[l], all);
+        if (link_kind[l] == 1) {
+            Vec f = all.moving, n = all.turning;
+            Real numbers[6] = {f.x, f.y, f.z, n.x, n.y, n.z};
+            INNER for (int k = 0; k < 6; k++) bias[dof + k] = numbers[k];
         }
     }
 }
@@ -194,61 +202,61 @@ INLINE void bias_of(const Environment& env, const Configuration& at, const Vec* 
 // Replaces A, given by rows of each coordinate and those above it, by the rows of the inverse of L, A = L^T L; L has the
 // pattern of A (Featherstone, "Efficient factorization of the joint-space inertia matrix for branched kinematic trees",
 // 2005).
-INLINE void factor(Real* A) {
-    for (int d = DOFS - 1; d >= 0; d--) {
+INLINE void factor(const Lanes& lanes, Real* A) {
+    UP_DOFS(lanes, d) {
         int last = dof_depth[d] - 1;
         Real* row = A + d * DEPTH;
+        INNER for (int i = below_start[d + 1] - 1; i >= below_start[d]; i--) {
+            const Real* from = A + dof_below[i] * DEPTH;
+            INNER for (int k = 0; k <= last; k++) row[k] -= from[last] * from[k];
+        }
         Real over = inverse_root(row[last]);
         row[last] = over;  // 1 / L_dd
-        for (int k = 0; k < last; k++) row[k] = over * row[k];
-        for (int i = 0; i < last; i++) {
-            Real* to = A + dof_above[d * DEPTH + i] * DEPTH;
-            for (int k = 0; k <= i; k++) to[k] -= row[i] * row[k];
-        }
+        INNER for (int k = 0; k < last; k++) row[k] = over * row[k];
     }
-    for (int d = 0; d < DOFS; d++) {
+    DOWN_DOFS(lanes, d) {
         int last = dof_depth[d] - 1;
         Real* row = A + d * DEPTH;
-        Real inverse[DEPTH];
-        for (int k = 0; k < last; k++) {
+        INNER for (int k = 0; k < last; k++) {
             Real sum = Real(0);
-            for (int i = k; i < last; i++) sum += row[i] * A[dof_above[d * DEPTH + i] * DEPTH + k];
-            inverse[k] = -(row[last] * sum);
+            INNER for (int i = k; i < last; i++) sum += row[i] * A[dof_above[d * DEPTH + i] * DEPTH + k];
+            row[k] = -(row[last] * sum);
         }
-        for (int k = 0; k < last; k++) row[k] = inverse[k];
     }
 }
 
 // x = inverse(A) b
-INLINE void solve_mass(const Real* inverse, const Real* b, Real* x) {
-    Real y[DOFS];
-    for (int d = 0; d < DOFS; d++) y[d] = Real(0);
-    for (int d = 0; d < DOFS; d++) {
-        for (int k = 0; k < dof_depth[d]; k++) y[dof_above[d * DEPTH + k]] += inverse[d * DEPTH + k] * b[d];
+INLINE void solve_mass(Chain& chain, const Lanes& lanes, const Real* b, Real* x) {
+    const Real* inverse = chain.inverse;
+    ROOM(Real, y, DOFS, chain.room);
+    DIVIDED(lanes, d, DOFS) {
+        int last = dof_depth[d] - 1;
+        Real sum = inverse[d * DEPTH + last] * b[d];
+        INNER for (int i = below_start[d]; i < below_start[d + 1]; i++) {
+            sum += inverse[dof_below[i] * DEPTH + last] * b[dof_below[i]];
+        }
+        y[d] = sum;
     }
-    for (int d = 0; d < DOFS; d++) {
+    lanes.sync();
+    DIVIDED(lanes, d, DOFS) {
         Real sum = Real(0);
-        for (int k = 0; k < dof_depth[d]; k++) sum += inverse[d * DEPTH + k] * y[dof_above[d * DEPTH + k]];
+        INNER for (int k = 0; k < dof_depth[d]; k++) sum += inverse[d * DEPTH + k] * y[dof_above[d * DEPTH + k]];
         x[d] = sum;
     }
+    lanes.sync();
 }
 
 // Target of a joint at a time, from the pieces of its chain's command: rows of 14 numbers, each with the time of the
 // knot and the coefficients of two joints.
-INLINE Real target_of(const Problem& problem, Environment& env, int c, int joint, Real time, bool first) {
+INLINE Real target_of(const Problem& problem, const Environment& env, int c, int joint, Real time) {
     int number = chain_command[c], rows = (chain_joints[c] + 1) / 2;
     long long start = env.drives + 14LL * problem.drive_starts[number];
     const Input& input = problem.drives;
-    int& cursor = env.chain.cursors[c];
-    if (first) {
-        int last = problem.drive_last[env.drive_last + number];
-        while (cursor < last && input.value[start + 14LL * rows * (cursor + 1)] <= plain(time)) cursor++;
-    }
-    long long at = start + 14LL * rows * cursor;
+    long long at = start + 14LL * rows * env.chain.cursors[c];
     Real since = at_least(time - input.at(at), Number(0));
     at += 14LL * (joint / 2) + 1 + 5 * (joint % 2);
     Real value = input.at(at + 4);
-    for (int k = 3; k >= 0; k--) value = value * since + input.at(at + k);
+    INNER for (int k = 3; k >= 0; k--) value = value * since + input.at(at + k);
     return value;
 }
 
@@ -264,24 +272,39 @@ INLINE Real limit_target(Real gap, Real speed, Real h, Real stiffness, Real damp
     return speed - damping * closed * speed - stiffness * at_most(ahead, Number(0)) * reciprocal(h);
 }
 
+// Moves on in the command of a chain to the piece of a time.
+INLINE void seek(const Problem& problem, Environment& env, int c, Real time) {
+    int number = chain_command[c], rows = (chain_joints[c] + 1) / 2, last = problem.drive_last[env.drive_last + number];
+    long long start = env.drives + 14LL * problem.drive_starts[number];
+    int& cursor = env.chain.cursors[c];
+    while (cursor < last && problem.drives.value[start + 14LL * rows * (cursor + 1)] <= plain(time)) cursor++;
+}
+
 // Generalised velocity of the chains after the forces of a step, without contact, and the roots of A; then the
 // velocities of the links at their poses of the start.
-INLINE void kick(const Problem& problem, Environment& env, Real time_after, const Mat* rotations, Motion* motions,
-                 Vec* velocities) {
+INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after, const Mat* rotations,
+                 Motion* motions) {
     Chain& chain = env.chain;
     Real h = env.laws[0].step_s, half_h = Number(0.5) * h;
-    Vec positions[LINKS], linear[LINKS], angular[LINKS], lift[LINKS], twist[LINKS];
-    Quat quats[LINKS];
-    Real speed[DOFS], force[DOFS], own[DOFS], still[DOFS];
+    ROOM(Vec, positions, LINKS, chain.room.place);
+    ROOM(Vec, linear, LINKS, chain.room.place);
+    ROOM(Vec, angular, LINKS, chain.room.place);
+    ROOM(Vec, lift, CHAINS, chain.room);
+    ROOM(Vec, twist, CHAINS, chain.room);
+    ROOM(Quat, quats, LINKS, chain.room.place);
+    ROOM(Real, first, DOFS, chain.room);
+    ROOM(Real, own, DOFS, chain.room);
+    ROOM(Real, kept, DOFS, chain.room);
 #if HEAVY
-    Real halfway[JOINTS + 1];
+    ROOM(Real, halfway, JOINTS + 1, chain.room);
 #endif
-    for (int d = 0; d < DOFS; d++) force[d] = own[d] = still[d] = Real(0);
-    for (int c = 0; c < CHAINS; c++) {
+    DIVIDED(lanes, d, DOFS) own[d] = kept[d] = Real(0);
+    lanes.sync();
+    DIVIDED(lanes, c, CHAINS) {
         int l = chain_root[c], b = link_body[l], dof = link_dof[l];
         Body& root = env.bodies[b];
-        lift[l] = -env.gravity;
-        twist[l] = none();
+        lift[c] = -env.gravity;
+        twist[c] = none();
         linear[l] = root.velocity;
         angular[l] = root.spin;
 #if DRIVEN
@@ -289,8 +312,8 @@ INLINE void kick(const Problem& problem, Environment& env, Real time_after, cons
             Body now = root;
             drive(problem, env, b, time_after);
             Real over = reciprocal(h);
-            lift[l] = lift[l] + over * (root.velocity - now.velocity);
-            twist[l] = over * (root.spin - now.spin);
+            lift[c] = lift[c] + over * (root.velocity - now.velocity);
+            twist[c] = over * (root.spin - now.spin);
             root = now;
         }
 #endif
@@ -298,159 +321,180 @@ INLINE void kick(const Problem& problem, Environment& env, Real time_after, cons
         quats[l] = normalized(multiply(quat_exp(half_h * root.spin), root.quat));
         if (dof >= 0) {
             Real numbers[6] = {root.velocity.x, root.velocity.y, root.velocity.z, root.spin.x, root.spin.y, root.spin.z};
-            for (int k = 0; k < 6; k++) speed[dof + k] = numbers[k];
+            INNER for (int k = 0; k < 6; k++) first[dof + k] = numbers[k];
         }
-        for (int i = 0; i < chain_joints[c]; i++) {
-            int j = chain_joint[c] + i, d = joint_dof[j];
-            const Servo& s = chain.servos[j];
-            speed[d] = chain.speeds[j];
+        if (chain_command[c] >= 0) seek(problem, env, c, time_after);
+    }
+    lanes.sync();
+    DIVIDED(lanes, j, JOINTS) {
+        int d = joint_dof[j], c = joint_chain[j];
+        const Servo& s = chain.servos[j];
+        first[d] = chain.speeds[j];
 #if HEAVY
-            halfway[j] = chain.values[j] + half_h * chain.speeds[j];
+        halfway[j] = chain.values[j] + half_h * chain.speeds[j];
 #endif
-            still[d] = s.armature;
-            own[d] = s.armature + h * s.damping;
-            if (chain_command[c] < 0) continue;
-            Real error = target_of(problem, env, c, i, time_after, i == 0) - chain.values[j];
+        own[d] = s.armature + h * s.damping;
+        Real force = Real(0);
+        if (chain_command[c] >= 0) {
+            Real error = target_of(problem, env, c, j - chain_joint[c], time_after) - chain.values[j];
             Real wanted = s.stiffness * error, pushed = wanted - h * s.stiffness * chain.speeds[j];
             Number size = plain(pushed) < Number(0) ? -plain(pushed) : plain(pushed);
             if (size > plain(s.torque_limit)) {
-                force[d] = plain(pushed) < Number(0) ? -s.torque_limit : s.torque_limit;
+                force = plain(pushed) < Number(0) ? -s.torque_limit : s.torque_limit;
             } else {
                 own[d] = own[d] + h * h * s.stiffness;
-                force[d] = wanted;
+                force = wanted;
             }
         }
+        kept[d] = s.armature * first[d] + h * force;
     }
     Real* A = chain.inverse;
-    for (int d = 0; d < DOFS; d++) {
-        for (int k = 0; k < dof_depth[d]; k++) A[d * DEPTH + k] = Real(0);
+    DIVIDED(lanes, d, DOFS) {
+        INNER for (int k = 0; k < dof_depth[d]; k++) A[d * DEPTH + k] = Real(0);
     }
-    Real kept[DOFS], right[DOFS];
+    lanes.sync();
 #if HEAVY
-    place_links(chain, halfway, positions, quats);
-    Configuration at;
-    configure(chain, positions, quats, at);
-    add_mass(chain, at, A);
+    place_links(chain, lanes, halfway, positions, quats);
+    ROOM(Configuration, at, 1, chain.before);
+    configure(chain, lanes, positions, quats, at[0]);
+    add_mass(chain, lanes, at[0], A);
 #endif
-    for (int d = 0; d < DOFS; d++) kept[d] = still[d] * speed[d] + h * force[d];
 #if HEAVY
-    for (int d = 0; d < DOFS; d++) {
+    DIVIDED(lanes, d, DOFS) {
         int last = dof_depth[d] - 1;
-        for (int k = 0; k < last; k++) {
-            int up = dof_above[d * DEPTH + k];
-            kept[d] += A[d * DEPTH + k] * speed[up];
-            kept[up] += A[d * DEPTH + k] * speed[d];
+        INNER for (int k = 0; k <= last; k++) kept[d] += A[d * DEPTH + k] * first[dof_above[d * DEPTH + k]];
+        INNER for (int i = below_start[d]; i < below_start[d + 1]; i++) {
+            kept[d] += A[dof_below[i] * DEPTH + last] * first[dof_below[i]];
         }
-        kept[d] += A[d * DEPTH + last] * speed[d];
     }
+    lanes.sync();
 #endif
-    for (int d = 0; d < DOFS; d++) A[d * DEPTH + dof_depth[d] - 1] += own[d];
-    factor(A);
+    DIVIDED(lanes, d, DOFS) A[d * DEPTH + dof_depth[d] - 1] += own[d];
+    lanes.sync();
+    factor(lanes, A);
 #if HEAVY
-    Real bias[DOFS], mean[DOFS];
-    for (int d = 0; d < DOFS; d++) mean[d] = speed[d];
+    ROOM(Real, bias, DOFS, chain.room);
+    ROOM(Real, mean, DOFS, chain.room);
+    DIVIDED(lanes, d, DOFS) mean[d] = first[d];
+    lanes.sync();
+    KEEP_LOOP
     for (int pass = 0; pass < 2; pass++) {
-        bias_of(env, at, linear, angular, lift, twist, mean, bias);
-        for (int d = 0; d < DOFS; d++) right[d] = kept[d] - h * bias[d];
-        solve_mass(A, right, chain.speed);
-        for (int d = 0; d < DOFS; d++) mean[d] = Number(0.5) * (speed[d] + chain.speed[d]);
+        bias_of(env, lanes, at[0], linear, angular, lift, twist, mean, bias);
+        DIVIDED(lanes, d, DOFS) bias[d] = kept[d] - h * bias[d];
+        lanes.sync();
+        solve_mass(chain, lanes, bias, chain.speed);
+        DIVIDED(lanes, d, DOFS) mean[d] = Number(0.5) * (first[d] + chain.speed[d]);
+        lanes.sync();
     }
 #else
-    for (int d = 0; d < DOFS; d++) right[d] = kept[d];
-    solve_mass(A, right, chain.speed);
+    solve_mass(chain, lanes, kept, chain.speed);
 #endif
     // the links at the start of the step, with the velocities without contact
-    for (int l = 0; l < LINKS; l++) {
+    DIVIDED(lanes, l, LINKS) {
         int b = link_body[l];
         positions[l] = env.bodies[b].position;
         chain.axes[l] = rotations[b] * chain.joints[l].axis;
         chain.known[l] = false;
     }
-    Real moving[JOINTS + 1];
-    for (int j = 0; j < JOINTS; j++) moving[j] = chain.speed[joint_dof[j]];
-    for (int c = 0; c < CHAINS; c++) {
+    ROOM(Real, moving, JOINTS + 1, chain.room);
+    DIVIDED(lanes, j, JOINTS) moving[j] = chain.speed[joint_dof[j]];
+    DIVIDED(lanes, c, CHAINS) {
         int l = chain_root[c], d = link_dof[l];
         if (d < 0) continue;
         linear[l] = vec(chain.speed[d], chain.speed[d + 1], chain.speed[d + 2]);
         angular[l] = vec(chain.speed[d + 3], chain.speed[d + 4], chain.speed[d + 5]);
     }
-    move_links(chain.axes, positions, moving, linear, angular);
-    for (int l = 0; l < LINKS; l++) {
+    lanes.sync();
+    move_links(lanes, chain.axes, positions, moving, linear, angular);
+    DIVIDED(lanes, l, LINKS) {
         int b = link_body[l];
-        velocities[b] = motions[b].velocity = linear[l];
+        motions[b].velocity = linear[l];
         motions[b].omega = angular[l];
         motions[b].columns = chain.columns + l * DEPTH;
         motions[b].depth = 0;
     }
-    for (int d = 0; d < DOFS; d++) chain.moved[d] = Real(0);
+    DIVIDED(lanes, d, DOFS) chain.moved[d] = Real(0);
     // limits: critically damped, with a natural time of LIMIT_TIME_S; see `coefficients`
     Real eta = Number(1 / LIMIT_TIME_S) * h, decay = exponential(-eta), twice = decay * decay;
     Real stiffness = Real(1) + twice - Number(2) * decay;
     Real damping = Number(0.5) * (Real(3) - Number(2) * decay - twice) - stiffness;
-    chain.active = false;
-    for (int j = 0; j < JOINTS; j++) {
+    if (lanes.writes()) chain.active = false;
+    lanes.sync();
+    DIVIDED(lanes, j, JOINTS) {
         if (!chain.acts[j]) continue;
         const Servo& s = chain.servos[j];
         chain.lower[j] = limit_target(chain.values[j] - s.lower, moving[j], h, stiffness, damping);
         chain.upper[j] = limit_target(s.upper - chain.values[j], -moving[j], h, stiffness, damping);
         bool warm = false;
-        for (int i = 0; i < 3; i++) warm = warm || plain(chain.impulses[3 * j + i]) != Number(0);
+        INNER for (int i = 0; i < 3; i++) warm = warm || plain(chain.impulses[3 * j + i]) != Number(0);
         if (warm || plain(s.friction) > Number(0) || plain(chain.lower[j]) > Number(-1e29) ||
             plain(chain.upper[j]) > Number(-1e29)) {
             chain.active = true;
         }
     }
+    lanes.sync();
 }
 
-// Makes the columns of a link that contact may move, at the pose of the start of the step.
-INLINE void reveal(Environment& env, Motion* motions, int b) {
+// Makes the columns of a link that contact may move, where it is wanted, at the pose of the start of the step.
+INLINE void reveal(Environment& env, const Lanes& lanes, Motion* motions, int b, bool wanted) {
     int l = body_link(b);
-    if (l < 0 || env.chain.known[l]) return;
+    if (l < 0) return;
     Chain& chain = env.chain;
-    int depth = link_depth[l];
+    if (chain.known[l]) wanted = false;
+    if (!lanes.any(wanted)) return;
+    int depth = wanted ? link_depth[l] : 0;
     Vec origin = env.bodies[b].position;
     Column* columns = chain.columns + l * DEPTH;
-    for (int k = 0; k < depth; k++) columns[k].linear = columns[k].turning = none();
-    for (int i = 0; i < depth; i++) {
+    ROOM(Column, single, DEPTH, chain.room);  // each coordinate alone
+    DIVIDED(lanes, i, depth) {
         int d = link_above[l * DEPTH + i], from = dof_link[d], kind = link_kind[from];
-        Column own;
-        own.turning = none();
+        Column& one = single[i];
+        one.turning = none();
         if (kind == 1) {
             int k = d - link_dof[from];
-            own.linear = k < 3 ? unit_vector(k) : cross(unit_vector(k - 3), origin - env.bodies[link_body[from]].position);
-            if (k >= 3) own.turning = unit_vector(k - 3);
+            one.linear = k < 3 ? unit_vector(k) : cross(unit_vector(k - 3), origin - env.bodies[link_body[from]].position);
+            if (k >= 3) one.turning = unit_vector(k - 3);
         } else if (kind == 2) {
-            own.turning = chain.axes[from];
-            own.linear = cross(own.turning, origin - env.bodies[link_body[from]].position);
+            one.turning = chain.axes[from];
+            one.linear = cross(one.turning, origin - env.bodies[link_body[from]].position);
         } else {
-            own.linear = chain.axes[from];
-        }
-        for (int k = 0; k <= i; k++) {
-            Real part = chain.inverse[d * DEPTH + k];
-            columns[k].linear = columns[k].linear + part * own.linear;
-            columns[k].turning = columns[k].turning + part * own.turning;
+            one.linear = chain.axes[from];
         }
     }
-    chain.known[l] = true;
-    motions[b].depth = depth;
+    lanes.sync();
+    DIVIDED(lanes, k, depth) {
+        Column sum = {none(), none()};
+        INNER for (int i = k; i < depth; i++) {
+            Real part = chain.inverse[link_above[l * DEPTH + i] * DEPTH + k];
+            sum.linear = sum.linear + part * single[i].linear;
+            sum.turning = sum.turning + part * single[i].turning;
+        }
+        columns[k] = sum;
+    }
+    if (wanted && lanes.writes()) {
+        chain.known[l] = true;
+        motions[b].depth = depth;
+    }
+    lanes.sync();
 }
 
 // Adds an impulse and its moment about the link's origin to the mass-weighted motion of its chain.
-INLINE void push_link(Chain& chain, int l, Vec impulse, Vec moment) {
+INLINE void push_link(Chain& chain, const Lanes& lanes, int l, Vec impulse, Vec moment) {
     const Column* columns = chain.columns + l * DEPTH;
-    for (int k = 0; k < link_depth[l]; k++) {
+    // the place of a coordinate is the same in all links: one lane does it for all of them
+    DIVIDED(lanes, k, link_depth[l]) {
         chain.moved[link_above[l * DEPTH + k]] += dot(columns[k].linear, impulse) + dot(columns[k].turning, moment);
     }
 }
 
-// One pass over the limits and the dry friction of the joints, one after another.
-INLINE void sweep_joints(Chain& chain, Real h) {
-    for (int j = 0; j < JOINTS; j++) {
+// One pass over the limits and the dry friction of the joints, one after another in each branch.
+INLINE void sweep_joints(Chain& chain, const Lanes& lanes, Real h) {
+    BRANCHES(lanes, j) {
         if (!chain.acts[j]) continue;
         int d = joint_dof[j], depth = dof_depth[d];
         const Real* row = chain.inverse + d * DEPTH;
         Real speed = chain.speed[d], mobility = Real(0);
-        for (int k = 0; k < depth; k++) {
+        INNER for (int k = 0; k < depth; k++) {
             speed += row[k] * chain.moved[dof_above[d * DEPTH + k]];
             mobility += row[k] * row[k];
         }
@@ -466,18 +510,20 @@ INLINE void sweep_joints(Chain& chain, Real h) {
         old[0] = below;
         old[1] = above;
         old[2] = rubbed;
-        for (int k = 0; k < depth; k++) chain.moved[dof_above[d * DEPTH + k]] += change * row[k];
+        INNER for (int k = 0; k < depth; k++) chain.moved[dof_above[d * DEPTH + k]] += change * row[k];
     }
 }
 
 // Mass-weighted motion of the chains under the impulses of their joints.
-INLINE void push_joints(Chain& chain) {
-    for (int d = 0; d < DOFS; d++) chain.moved[d] = Real(0);
-    for (int j = 0; j < JOINTS; j++) {
+INLINE void push_joints(Chain& chain, const Lanes& lanes) {
+    DIVIDED(lanes, d, DOFS) chain.moved[d] = Real(0);
+    lanes.sync();
+    if (!chain.active) return;  // all impulses are zero
+    BRANCHES(lanes, j) {
         if (!chain.acts[j]) continue;
         int d = joint_dof[j];
         Real sum = chain.impulses[3 * j] - chain.impulses[3 * j + 1] + chain.impulses[3 * j + 2];
-        for (int k = 0; k < dof_depth[d]; k++) {
+        INNER for (int k = 0; k < dof_depth[d]; k++) {
             chain.moved[dof_above[d * DEPTH + k]] += sum * chain.inverse[d * DEPTH + k];
         }
     }
@@ -494,11 +540,14 @@ INLINE void gain(const Chain& chain, int l, Vec& linear, Vec& angular) {
 }
 
 // Moves the links to where the roots and the joints put them, with their velocities.
-INLINE void spread(Environment& env) {
-    const Chain& chain = env.chain;
-    Vec positions[LINKS], linear[LINKS], angular[LINKS], axes[LINKS];
-    Quat quats[LINKS];
-    for (int c = 0; c < CHAINS; c++) {
+INLINE void spread(Environment& env, const Lanes& lanes) {
+    Chain& chain = env.chain;
+    ROOM(Vec, positions, LINKS, chain.room.place);
+    ROOM(Vec, linear, LINKS, chain.room.place);
+    ROOM(Vec, angular, LINKS, chain.room.place);
+    ROOM(Quat, quats, LINKS, chain.room.place);
+    ROOM(Vec, axes, LINKS, chain);
+    DIVIDED(lanes, c, CHAINS) {
         int l = chain_root[c];
         const Body& root = env.bodies[link_body[l]];
         positions[l] = root.position;
@@ -506,42 +555,46 @@ INLINE void spread(Environment& env) {
         linear[l] = root.velocity;
         angular[l] = root.spin;
     }
-    place_links(chain, chain.values, positions, quats);
-    for (int l = 0; l < LINKS; l++) axes[l] = rotated(quats[l], chain.joints[l].axis);
-    move_links(axes, positions, chain.speeds, linear, angular);
-    for (int l = 0; l < LINKS; l++) {
+    lanes.sync();
+    place_links(chain, lanes, chain.values, positions, quats);
+    DIVIDED(lanes, l, LINKS) axes[l] = rotated(quats[l], chain.joints[l].axis);
+    lanes.sync();
+    move_links(lanes, axes, positions, chain.speeds, linear, angular);
+    DIVIDED(lanes, l, LINKS) {
         Body& body = env.bodies[link_body[l]];
         body.position = positions[l];
         body.quat = quats[l];
         body.velocity = linear[l];
         body.spin = angular[l];
     }
+    lanes.sync();
 }
 
 // Moves the chains to the end of the step, in which impulses changed their motion.
-INLINE void settle(const Problem& problem, Environment& env, Real time_after) {
+INLINE void settle(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after) {
     Chain& chain = env.chain;
     Real h = env.laws[0].step_s, half_h = Number(0.5) * h;
-    Real speed[DOFS];
-    for (int d = 0; d < DOFS; d++) {
-        speed[d] = chain.speed[d];
-        for (int k = 0; k < dof_depth[d]; k++) {
-            speed[d] += chain.inverse[d * DEPTH + k] * chain.moved[dof_above[d * DEPTH + k]];
+    ROOM(Real, first, DOFS, chain.room);
+    DIVIDED(lanes, d, DOFS) {
+        first[d] = chain.speed[d];
+        INNER for (int k = 0; k < dof_depth[d]; k++) {
+            first[d] += chain.inverse[d * DEPTH + k] * chain.moved[dof_above[d * DEPTH + k]];
         }
     }
-    for (int j = 0; j < JOINTS; j++) {
-        Real after = speed[joint_dof[j]];
+    lanes.sync();
+    DIVIDED(lanes, j, JOINTS) {
+        Real after = first[joint_dof[j]];
         chain.values[j] = chain.values[j] + half_h * (chain.speeds[j] + after);
         chain.speeds[j] = after;
     }
-    for (int c = 0; c < CHAINS; c++) {
+    DIVIDED(lanes, c, CHAINS) {
         int l = chain_root[c], b = link_body[l], d = link_dof[l];
         Body& root = env.bodies[b];
 #if DRIVEN
         if (drive_number(b) >= 0) drive(problem, env, b, time_after);
 #endif
         if (d >= 0) {
-            Vec velocity = vec(speed[d], speed[d + 1], speed[d + 2]), omega = vec(speed[d + 3], speed[d + 4], speed[d + 5]);
+            Vec velocity = vec(first[d], first[d + 1], first[d + 2]), omega = vec(first[d + 3], first[d + 4], first[d + 5]);
             root.position = root.position + half_h * (root.velocity + velocity);
             root.quat = normalized(multiply(quat_exp(half_h * root.spin), root.quat));
             root.quat = normalized(multiply(quat_exp(half_h * omega), root.quat));
@@ -549,6 +602,7 @@ INLINE void settle(const Problem& problem, Environment& env, Real time_after) {
             root.spin = omega;
         }
     }
-    spread(env);
+    lanes.sync();
+    spread(env, lanes);
 }
 #endif

@@ -14,13 +14,13 @@ INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocit
 #if EFFECTS
 #if SURFACE
 // Adds the impulse of the adhesion of the ground to a body's velocity and angular momentum.
-INLINE void stick(const Problem& problem, const Environment& env, int b, const Mat& rotation, Vec& velocity,
-                  Vec& spin) {
+INLINE void stick(const Problem& problem, const Environment& env, const Lanes& lanes, int b, const Mat& rotation,
+                  Vec& velocity, Vec& spin) {
     const Surface& s = env.laws[0].surface;
     if (absent(s.adhesion)) return;
     Real sum = Real(0), most = Real(0), each = reciprocal(s.reach);
     Vec arms = none();
-    for (int k = env.lanes.lane; k < low_count(b); k += LANES) {
+    for (int k = lanes.lane; k < low_count(b); k += LANES) {
         long long row = env.geometry + 4LL * problem.spheres[low_start(b) + k];
         Vec arm = rotation * (problem.geometry.vector(row) - env.constants[b].com);
         arm.z = arm.z - problem.geometry.at(row + 3);
@@ -31,9 +31,9 @@ INLINE void stick(const Problem& problem, const Environment& env, int b, const M
         arms = arms + near * arm;
         if (plain(near) > plain(most)) most = near;
     }
-    sum = env.lanes.sum(sum);
-    arms = env.lanes.sum(arms);
-    most = -env.lanes.least(-most);
+    sum = lanes.sum(sum);
+    arms = lanes.sum(arms);
+    most = -lanes.least(-most);
     // the weights are normalised to that of the lowest sphere: the force does not depend on the number of spheres
     Real pull = -(env.laws[0].step_s * s.adhesion * most * reciprocal(at_least(sum, Number(1e-12))));
     velocity.z += env.constants[b].inverse_mass * pull * sum;
@@ -44,20 +44,21 @@ INLINE void stick(const Problem& problem, const Environment& env, int b, const M
 
 #if MAGNETS
 // Height of the lowest sphere of a body that can touch the ground, at least 0.
-__device__ Real height_of(const Problem& problem, const Environment& env, int b, const Mat& rotation) {
+__device__ Real height_of(const Problem& problem, const Environment& env, const Lanes& lanes, int b,
+                          const Mat& rotation) {
     Real lowest = Real(Number(1e30));
-    for (int k = env.lanes.lane; k < low_count(b); k += LANES) {
+    for (int k = lanes.lane; k < low_count(b); k += LANES) {
         long long row = env.geometry + 4LL * problem.spheres[low_start(b) + k];
         Vec arm = problem.geometry.vector(row) - env.constants[b].com;
         Real low = dot(rotation.z, arm) - problem.geometry.at(row + 3);
         if (plain(low) < plain(lowest)) lowest = low;
     }
-    return at_least(env.bodies[b].position.z - env.ground + env.lanes.least(lowest), Number(0));
+    return at_least(env.bodies[b].position.z - env.ground + lanes.least(lowest), Number(0));
 }
 #endif
 
-INLINE void apply(const Problem& problem, const Environment& env, int b, const Mat& rotation, Vec omega,
-                  Vec& velocity, Vec& spin) {
+INLINE void apply(const Problem& problem, const Environment& env, const Lanes& lanes, int b, const Mat& rotation,
+                  Vec omega, Vec& velocity, Vec& spin) {
     const Wrenches& w = env.wrenches;
     const Body& body = env.bodies[b];
     Real h = env.laws[0].step_s;
@@ -68,7 +69,7 @@ INLINE void apply(const Problem& problem, const Environment& env, int b, const M
 #if MAGNETS
     bool pulled = false;
     for (int i = 0; i < MAGNETS; i++) pulled = pulled || !absent(w.magnets[i]);
-    Real height = pulled ? height_of(problem, env, b, rotation) : Real(0);
+    Real height = pulled ? height_of(problem, env, lanes, b, rotation) : Real(0);
     for (int i = 0; i < MAGNETS; i++) {
         if (absent(w.magnets[i])) continue;
         a.z = a.z - w.magnets[i] * exponential(-height * reciprocal(w.magnet_ranges[i]));
@@ -80,7 +81,7 @@ INLINE void apply(const Problem& problem, const Environment& env, int b, const M
     spin = spin + h * (rotation * solved(env.constants[b].inverse_inertia, transposed(rotation, w.twist)));
 #endif
 #if SURFACE
-    stick(problem, env, b, rotation, velocity, spin);
+    stick(problem, env, lanes, b, rotation, velocity, spin);
 #endif
 }
 #endif
@@ -456,96 +457,158 @@ INLINE bool boxes_apart(const Constants& ours, const Constants& other, const Fra
     return false;
 }
 
-// Finds the contacts of two bodies and distributes the effective mass among them; returns how many touch. The list also
-// has contacts that just opened, because their impulses of the previous step act until the first iteration.
-__device__ int touch_pair(const Problem& problem, Environment& env, int p, const Mat* rotations,
-                          Motion* motions, Contact* list, Real* weights, int& count) {
-    int a = pair_a(p), b = pair_b(p), first = count, touching = 0;
+struct Reach {  // how far the points of two bodies may come in a step
+    Number near, limit;
+    Frame frames[2];  // of b in a, of a in b
+};
+
+// Whether two bodies may touch in this step, by the spheres around their centres of mass and the boxes of their spheres.
+INLINE bool may_touch(const Environment& env, int p, const Mat* rotations, const Motion* motions, Reach& reach) {
+    int a = pair_a(p), b = pair_b(p);
     const Constants &ca = env.constants[a], &cb = env.constants[b];
     const Motion &ma = motions[a], &mb = motions[b];
-    Vec com_a = env.bodies[a].position, com_b = env.bodies[b].position;
     // points at a gap g approach at V + W g / 2 at most, so those beyond h V / (1 - h W / 2) cannot touch in this step
     Number spins = size(ma.omega) + size(mb.omega), h = plain(env.laws[0].step_s);
     Number V = size(ma.velocity - mb.velocity) + size(ma.omega) * (ca.reach + Number(SMOOTHING_M)) +
                size(mb.omega) * (cb.reach + Number(SMOOTHING_M));
-    Number near = Number(1e-9 + SMOOTHING_M) + h * (size(ma.velocity - mb.velocity) + size(ma.omega) * ca.reach +
-                                                    size(mb.omega) * cb.reach);
+    reach.near = Number(1e-9 + SMOOTHING_M) + h * (size(ma.velocity - mb.velocity) + size(ma.omega) * ca.reach +
+                                                   size(mb.omega) * cb.reach);
     Number left = Number(1) - Number(0.5) * h * spins;
-    Number limit = left > Number(0.01) ? h * V / left + Number(1e-6) : Number(1e30);
-    if (size(com_a - com_b) - ca.reach - cb.reach - Number(SMOOTHING_M) < limit) {
-        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES, end = contact_count(p);
-        Parting parting;
-        const Frame frames[2] = {frame_in(env, b, a, rotations), frame_in(env, a, b, rotations)};
-        const Number margin = Number(1 + 1e-5) * (limit + Number(SMOOTHING_M));
-        if (boxes_apart(cb, ca, frames[0], margin) || boxes_apart(ca, cb, frames[1], margin)) end = 0;
+    reach.limit = left > Number(0.01) ? h * V / left + Number(1e-6) : Number(1e30);
+    Number apart = size(env.bodies[a].position - env.bodies[b].position);
+    if (!(apart - ca.reach - cb.reach - Number(SMOOTHING_M) < reach.limit)) return false;
+    reach.frames[0] = frame_in(env, b, a, rotations);
+    reach.frames[1] = frame_in(env, a, b, rotations);
+    const Number margin = Number(1 + 1e-5) * (reach.limit + Number(SMOOTHING_M));
+    return !boxes_apart(cb, ca, reach.frames[0], margin) && !boxes_apart(ca, cb, reach.frames[1], margin);
+}
+
+// Makes the contact of slot `k` of a pair of bodies: 2 where it touches, 1 where it just opened, whose impulse of the
+// previous step acts until the first iteration, 0 for none.
+INLINE int make_contact(const Problem& problem, const Environment& env, const Own& own, int p, int k,
+                        const Mat* rotations, const Motion* motions, Number limit, Number near, const Parting& parting,
+                        Contact& c, Real& weight) {
+    int a = pair_a(p), b = pair_b(p), found = 2;
+    const Motion &ma = motions[a], &mb = motions[b];
+    Facing facing;
+    if (!face(problem, env, p, k, rotations, limit, parting, facing)) return 0;
+    c.normal = facing.normal;
+    c.arm = facing.point - env.bodies[a].position;
+    c.arm_b = facing.point - env.bodies[b].position;
+    c.a = a;
+    c.b = b;
+    c.slot = (contact_start(p) + k) / LANES;
+    Real speed = dot(relative_velocity(c, motions), c.normal);
+#if LINKS
+    Real inverse_mass = Real(0), mobility = Real(0);
+    add_mobility(ma, c.arm, c.normal, inverse_mass, mobility);
+    add_mobility(mb, c.arm_b, c.normal, inverse_mass, mobility);
+#else
+    Vec turn_a = cross(c.arm, c.normal), turn_b = cross(c.arm_b, c.normal);
+    Real inverse_mass = ma.inverse_mass + dot(turn_a, ma.inverse_inertia * turn_a) + mb.inverse_mass +
+                        dot(turn_b, mb.inverse_inertia * turn_b);
+    Real mobility = mobility_trace(ma, c.arm) + mobility_trace(mb, c.arm_b);
+#endif
+    if (!prepare(c, env.laws[pair_law(p)], facing.gap, speed, inverse_mass, mobility, weight)) {
+        if (!own.warm || !(plain(own.before[c.slot].x) > Number(0)) || !(facing.sharp_gap < near)) return 0;
+        c.target = Real(Number(-1e30));
+        c.stop_n = c.stop_t = Real(1);
+        found = 1;
+    }
+    if (own.warm) {
+        Vec along = own.before[c.slot], one, two;
+        tangents(env, c.normal, one, two);
+        c.impulse = along.x * c.normal + along.y * one + along.z * two;
+    }
+    return found;
+}
+
+#if QUEUED
+// Slots of which a lane makes the contacts: from the front those against few spheres, from the back those against many,
+// so that all lanes come to these at the same time.
+const int LONG = 16;
+struct Candidates {
+    int slots[SLOTS], few, many;
+    INLINE void add(int p, int k, bool longer) { slots[longer ? SLOTS - ++many : few++] = p << 16 | k; }
+};
+
+// Lists the slots of a pair of bodies that may meet, of which this lane makes the contacts later: those of all pairs
+// together, as each pair alone would leave most lanes idle.
+INLINE void queue_pair(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
+                       Motion* motions, Candidates& queue) {
+    int a = pair_a(p), b = pair_b(p), start = contact_start(p);
+    const bool near = env.room.near[p];
+    reveal(env, own.lanes, motions, a, near);
+    reveal(env, own.lanes, motions, b, near);
+    if (!near) return;
+    const Number limit = env.room.limits[p];
+    const int spheres_of_b = sphere_count(b);
+    KEEP_LOOP
+    for (int second = 0; second < 2; second++) {  // spheres of b, then those of a
+        const Frame frame = second ? frame_in(env, a, b, rotations) : frame_in(env, b, a, rotations);
+        const Constants& other = env.constants[second ? b : a];
+        const int first = start + (second ? spheres_of_b : 0), count = sphere_count(second ? a : b);
+        const bool longer = sphere_count(second ? b : a) > LONG;
+        const Number* spheres = problem.geometry.value + env.geometry + 4LL * sphere_start(second ? a : b);
+        EACH_OWNED(own.lanes, first, count, k) {
+            AlignedRow row = row_of(spheres + 4LL * k);
+            const Number sphere[4] = {row.a, row.b, row.c, row.d};
+            if (!beside(other, frame, sphere, limit)) queue.add(p, first - start + k, longer);
+        }
+    }
+}
+#else
+// Finds the contacts of two bodies and distributes the effective mass among them; returns how many touch.
+__device__ int touch_pair(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
+                          Motion* motions, Contact* list, Real* weights, int& count) {
+    int a = pair_a(p), b = pair_b(p), first = count, touching = 0;
+    const Constants &ca = env.constants[a], &cb = env.constants[b];
+    Reach reach;
+    bool near = may_touch(env, p, rotations, motions, reach);
+    Parting parting;
 #if HULLS
+    bool parts = false;
+    if (near) {
         // nothing of one hull is nearer to the other one than the gap along any axis
         Number* parted = env.parted[p];
         const bool known = parted[0] != Number(0) || parted[1] != Number(0) || parted[2] != Number(0);
-        if (end > 0 && known && gap_along(problem, env, a, b, rotations, parted) > limit) end = 0;
-        if (end > 0 && part(problem, env, p, rotations, limit, parting) && parting.gap > limit) {
-            for (int k = 0; k < 3; k++) parted[k] = parting.axis[k];
-            end = 0;
-        }
+        if (known && gap_along(problem, env, a, b, rotations, parted) > reach.limit) near = false;
+        parts = near && part(problem, env, p, rotations, reach.limit, parting) && parting.gap > reach.limit;
+        if (parts) near = false;
+    }
+    own.lanes.sync();
+    if (parts && own.lanes.writes()) {
+        for (int k = 0; k < 3; k++) env.parted[p][k] = parting.axis[k];
+    }
 #endif
 #if LINKS
-        if (end > 0) {
-            reveal(env, motions, a);
-            reveal(env, motions, b);
-        }
+    reveal(env, own.lanes, motions, a, near);
+    reveal(env, own.lanes, motions, b, near);
 #endif
-        const int spheres_of_b = sphere_count(b), spheres_in_all = spheres_of_b + sphere_count(a);
-        for (int k = behind; k < end; k += LANES) {
+    if (near) {
+        const int start = contact_start(p), spheres_of_b = sphere_count(b), spheres_in_all = spheres_of_b + sphere_count(a);
+        EACH_OWNED(own.lanes, start, contact_count(p), k) {
             if (k < spheres_in_all) {
                 const bool second = k >= spheres_of_b;
                 const Number* sphere = problem.geometry.value + env.geometry + 4LL * problem.spheres[start + k];
-                if (beside(second ? cb : ca, frames[second], sphere, limit)) continue;
+                if (beside(second ? cb : ca, reach.frames[second], sphere, reach.limit)) continue;
             }
-            Facing facing;
-            Real weight;
-            if (!face(problem, env, p, k, rotations, limit, parting, facing)) continue;
-            Contact& c = list[count];
-            c.normal = facing.normal;
-            c.arm = facing.point - com_a;
-            c.arm_b = facing.point - com_b;
-            c.a = a;
-            c.b = b;
-            c.slot = (start + k) / LANES;
-            Real speed = dot(relative_velocity(c, motions), c.normal);
-#if LINKS
-            Real inverse_mass = Real(0), mobility = Real(0);
-            add_mobility(ma, c.arm, c.normal, inverse_mass, mobility);
-            add_mobility(mb, c.arm_b, c.normal, inverse_mass, mobility);
-#else
-            Vec turn_a = cross(c.arm, c.normal), turn_b = cross(c.arm_b, c.normal);
-            Real inverse_mass = ma.inverse_mass + dot(turn_a, ma.inverse_inertia * turn_a) + mb.inverse_mass +
-                                dot(turn_b, mb.inverse_inertia * turn_b);
-            Real mobility = mobility_trace(ma, c.arm) + mobility_trace(mb, c.arm_b);
-#endif
-            if (prepare(c, env.laws[pair_law(p)], facing.gap, speed, inverse_mass, mobility, weight)) {
-                touching++;
-            } else {
-                if (!env.warm || !(plain(env.before[c.slot].x) > Number(0)) || !(facing.sharp_gap < near)) continue;
-                c.target = Real(Number(-1e30));
-                c.stop_n = c.stop_t = Real(1);
-            }
-            if (env.warm) {
-                Vec along = env.before[c.slot], one, two;
-                tangents(env, c.normal, one, two);
-                c.impulse = along.x * c.normal + along.y * one + along.z * two;
-            }
-            weights[count++] = weight;
+            int found = make_contact(problem, env, own, p, k, rotations, motions, reach.limit, reach.near, parting,
+                                     list[count], weights[count]);
+            if (found == 2) touching++;
+            if (found > 0) count++;
         }
     }
-    if (env.lanes.any(count > first)) share_out_pair(env.lanes, list, weights, first, count, motions);
+    if (own.lanes.any(count > first)) share_out_pair(SHOWN_TO(own.lanes, env), list, weights, first, count, motions);
     return touching;
 }
+#endif
 
 #if FIXED
 // Finds the contacts of a body with a fixed surface and distributes the effective mass among them; returns how many
 // touch.
-__device__ int touch_surface(const Problem& problem, Environment& env, int p, const Mat* rotations, Motion* motions,
-                             Contact* list, Real* weights, int& count) {
+__device__ int touch_surface(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
+                             Motion* motions, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), s = -2 - pair_b(p), first = count;
     const Motion& m = motions[a];
     Vec com = env.bodies[a].position;
@@ -553,14 +616,16 @@ __device__ int touch_surface(const Problem& problem, Environment& env, int p, co
     // no point of the body moves further in this step, up to rounding
     Number margin = h * (size(m.velocity) + size(m.omega) * reach) + Number(1e-6);
     Fixed fixed = fixed_surface(problem, env, s);
-    if (least_distance(problem, fixed, s, transposed(fixed.rotation, com - fixed.position)) - reach < margin) {
-        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
+    const Vec place = transposed(fixed.rotation, com - fixed.position);
+    const bool near = least_distance(problem, fixed, s, place) - reach < margin;
 #if LINKS
-        reveal(env, motions, a);
+    reveal(env, own.lanes, motions, a, near);
 #endif
+    if (near) {
+        const int start = contact_start(p);
         Searched searched;
         searched.sphere = -1;
-        for (int k = behind; k < contact_count(p); k += LANES) {
+        EACH_OWNED(own.lanes, start, contact_count(p), k) {
             Vec center;
             Real radius, weight;
             Meeting meeting;
@@ -584,27 +649,27 @@ __device__ int touch_surface(const Problem& problem, Environment& env, int p, co
             Real mobility = mobility_trace(m, c.arm);
 #endif
             if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weight)) continue;
-            if (env.warm) {
-                Vec along = env.before[c.slot], one, two;
+            if (own.warm) {
+                Vec along = own.before[c.slot], one, two;
                 tangents(env, c.normal, one, two);
                 c.impulse = along.x * c.normal + along.y * one + along.z * two;
             }
             weights[count++] = weight;
         }
     }
-    if (env.lanes.any(count > first)) share_out_pair(env.lanes, list, weights, first, count, motions);
+    if (own.lanes.any(count > first)) share_out_pair(SHOWN_TO(own.lanes, env), list, weights, first, count, motions);
     return count - first;
 }
 #endif
 
 #if LINKS
 // Finds the contacts of a link with the ground, and distributes the effective mass among them as between two bodies.
-__device__ int touch_plane_link(const Problem& problem, Environment& env, int p, const Mat* rotations, Motion* motions,
-                                Contact* list, Real* weights, int& count) {
+__device__ int touch_plane_link(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
+                                Motion* motions, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), first = count, start = contact_start(p);
-    reveal(env, motions, a);
+    reveal(env, own.lanes, motions, a, true);
     Vec up = vec(Real(0), Real(0), Real(1));
-    for (int k = (env.lanes.lane - start % LANES + LANES) % LANES; k < contact_count(p); k += LANES) {
+    EACH_OWNED(own.lanes, start, contact_count(p), k) {
         long long row = env.geometry + 4LL * problem.spheres[start + k];
         Contact& c = list[count];
         c.arm = rotations[a] * problem.geometry.vector(row) - problem.geometry.at(row + 3) * up;
@@ -617,17 +682,17 @@ __device__ int touch_plane_link(const Problem& problem, Environment& env, int p,
         Real speed = relative_velocity(c, motions).z;
         add_mobility(motions[a], c.arm, up, inverse_mass, mobility);
         if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weights[count])) continue;
-        c.impulse = env.before[c.slot];
+        c.impulse = own.before[c.slot];
         count++;
     }
-    if (env.lanes.any(count > first)) share_out_pair(env.lanes, list, weights, first, count, motions);
+    if (own.lanes.any(count > first)) share_out_pair(SHOWN_TO(own.lanes, env), list, weights, first, count, motions);
     return count - first;
 }
 #endif
 
 // Divides the effective mass of a body by the number of groups of contacts on it; `groups` counts them by body.
 INLINE void split(Contact* list, int count, const int* groups) {
-    for (int i = 0; i < count; i++) {
+    INNER for (int i = 0; i < count; i++) {
         Contact& c = list[i];
         int most = groups[group_of(c.a)], other = c.b >= 0 ? group_of(c.b) : -1;
         if (other >= 0 && groups[other] > most) most = groups[other];
@@ -648,7 +713,7 @@ struct Pushed {  // impulse of the contacts of a pair on a, and their moments ab
 };
 
 // Sums the impulses of the contacts from `first` to `end`, which belong to one pair, over the lanes.
-INLINE Pushed pushed_by(const Environment& env, const Contact* list, int first, int end, int b) {
+INLINE Pushed pushed_by(const Lanes& lanes, const Contact* list, int first, int end, int b) {
     Pushed sum = {none(), none(), none()};
     const bool both = b >= 0 && is_free(b);
     for (int i = first; i < end; i++) {
@@ -657,9 +722,9 @@ INLINE Pushed pushed_by(const Environment& env, const Contact* list, int first, 
         sum.angular_a = sum.angular_a + cross(c.arm, c.impulse);
         if (both) sum.angular_b = sum.angular_b + cross(c.arm_b, c.impulse);
     }
-    sum.linear = env.lanes.sum(sum.linear);
-    sum.angular_a = env.lanes.sum(sum.angular_a);
-    if (both) sum.angular_b = env.lanes.sum(sum.angular_b);
+    sum.linear = lanes.sum(sum.linear);
+    sum.angular_a = lanes.sum(sum.angular_a);
+    if (both) sum.angular_b = lanes.sum(sum.angular_b);
     return sum;
 }
 
@@ -686,41 +751,132 @@ INLINE void aim_under_load(const Law& law, Contact* list, int first, int end, co
 }
 #endif
 
+#if SHARED
+// Lists the bodies that contacts may move: links that are known, then the free bodies.
+INLINE void list_reached(Environment& env, const Lanes& lanes) {
+    Chain& chain = env.chain;
+    if (lanes.writes()) {
+        int count = 0;
+        KEEP_LOOP
+        for (int l = 0; l < LINKS; l++) {
+            if (chain.known[l]) chain.reached[count++] = link_body[l];
+        }
+        chain.reached_links = count;
+        KEEP_LOOP
+        for (int b = 0; b < BODIES; b++) {
+            if (is_free(b)) chain.reached[count++] = b;
+        }
+        chain.reached_count = count;
+    }
+    lanes.sync();
+}
+
+// Changes the impulses of the contacts by one iteration where it is asked for, and sums up what they do to each body that
+// they may move. In each round every lane shows one contact; each of these bodies is summed up by one lane.
+INLINE void sweep_contacts(Environment& env, const Lanes& lanes, Contact* list, int count, const Motion* motions,
+                           bool changes) {
+    Chain& chain = env.chain;
+    ContactRoom& room = chain.room.free.contacts;
+    DIVIDED(lanes, r, chain.reached_count) chain.pushes[r] = chain.moments[r] = none();
+    KEEP_LOOP
+    for (int i = 0; lanes.any(i < count); i++) {
+        room.bodies[lanes.lane] = -1;
+        if (i < count) {
+            Contact& c = list[i];
+            if (changes) c.impulse = swept(c, env.laws[0], relative_velocity(c, motions));
+            room.first[lanes.lane] = c.impulse;
+            room.second[lanes.lane] = cross(c.arm, c.impulse);
+            if (c.b >= 0) room.third[lanes.lane] = cross(c.arm_b, c.impulse);
+            room.bodies[lanes.lane] = bodies_of(c);
+        }
+        lanes.sync();
+        DIVIDED(lanes, r, chain.reached_count) {
+            const int body = chain.reached[r];
+            Vec push = chain.pushes[r], moment = chain.moments[r];
+            EACH_SHOWN
+            for (int shown = 0; shown < LANES; shown++) {
+                const int bodies = room.bodies[shown];
+                if (bodies >> 16 == body) {
+                    push = push + room.first[shown];
+                    moment = moment + room.second[shown];
+                } else if ((bodies & 0xffff) == body) {
+                    push = push - room.first[shown];
+                    moment = moment - room.third[shown];
+                }
+            }
+            chain.pushes[r] = push;
+            chain.moments[r] = moment;
+        }
+        lanes.sync();
+    }
+}
+
+// Moves the bodies that contacts may move by their impulses; `joints`: after one pass over the joints. In the last
+// iteration the moments are added to the angular momenta.
+INLINE void move_bodies(Environment& env, const Lanes& lanes, Motion* motions, Vec* spins, bool joints, bool last) {
+    Chain& chain = env.chain;
+    push_joints(chain, lanes);
+    lanes.sync();
+    KEEP_LOOP
+    for (int r = 0; r < chain.reached_links; r++) {
+        push_link(chain, lanes, body_link(chain.reached[r]), chain.pushes[r], chain.moments[r]);
+    }
+    lanes.sync();
+    if (joints && chain.active) sweep_joints(chain, lanes, env.laws[0].step_s);
+    lanes.sync();
+    DIVIDED(lanes, r, chain.reached_count) {
+        const int b = chain.reached[r];
+        Motion& m = motions[b];
+        Vec velocity = chain.room.free.free_velocities[b], omega = chain.room.free.free_omegas[b];
+        if (r < chain.reached_links) {
+            gain(chain, body_link(b), velocity, omega);
+        } else {
+            velocity = velocity + m.inverse_mass * chain.pushes[r];
+            omega = omega + m.inverse_inertia * chain.moments[r];
+            if (last) spins[FREE(b)] = spins[FREE(b)] + chain.moments[r];
+        }
+        m.velocity = velocity;
+        m.omega = omega;
+    }
+    lanes.sync();
+}
+#endif
+
 // Discards the impulses of the previous step.
-INLINE void forget(Environment& env) {
-    if (!env.warm) return;
+INLINE void forget(Own& own) {
+    if (!own.warm) return;
 #if PAIRED
-    for (int i = 0; i < env.kept_count; i++) env.before[env.kept[i]] = none();
-    env.kept_count = 0;
+    INNER for (int i = 0; i < own.kept_count; i++) own.before[own.kept[i]] = none();
+    own.kept_count = 0;
 #else
     EACH_SLOT
-    for (int i = 0; i < SLOTS; i++) env.before[i] = none();
+    for (int i = 0; i < SLOTS; i++) own.before[i] = none();
 #endif
-    env.warm = false;
+    own.warm = false;
 }
 
 // Stores the impulses of a step as the start of the next one's iterations; a single iteration starts at zero.
-INLINE void keep(Environment& env, const Contact* list, int count, int sweeps) {
+INLINE void keep(const Environment& env, Own& own, const Contact* list, int count, int sweeps) {
     if (sweeps < 2) return;
 #if PAIRED
-    forget(env);
-    for (int i = 0; i < count; i++) {
+    forget(own);
+    INNER for (int i = 0; i < count; i++) {
         const Contact& c = list[i];
         Vec one, two;
         tangents(env, c.normal, one, two);
         Vec along = vec(dot(c.impulse, c.normal), dot(c.impulse, one), dot(c.impulse, two));
-        env.before[c.slot] = c.b == -1 ? c.impulse : along;
-        env.kept[i] = c.slot;
+        own.before[c.slot] = c.b == -1 ? c.impulse : along;
+        own.kept[i] = c.slot;
     }
-    env.kept_count = count;
+    own.kept_count = count;
 #elif LISTED
-    forget(env);
-    for (int i = 0; i < count; i++) env.before[list[i].slot] = list[i].impulse;
+    forget(own);
+    for (int i = 0; i < count; i++) own.before[list[i].slot] = list[i].impulse;
 #else
     EACH_SLOT
-    for (int i = 0; i < SLOTS; i++) env.before[i] = list[i].on ? list[i].impulse : none();
+    for (int i = 0; i < SLOTS; i++) own.before[i] = list[i].on ? list[i].impulse : none();
 #endif
-    env.warm = count > 0;
+    own.warm = count > 0;
 }
 
 #if PATCHES
@@ -741,7 +897,7 @@ INLINE void share_by_area(const Lanes& lanes, const Moments& moments, const Moti
 
 // Finds the contacts of a body with the ground. They are appended to the list (LISTED), or each is stored in its own
 // slot.
-INLINE void touch_plane(const Problem& problem, const Environment& env, int p, const Mat& rotation,
+INLINE void touch_plane(const Problem& problem, const Environment& env, const Own& own, int p, const Mat& rotation,
                         const Motion& motion, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), first = count;
     Moments moments = {Real(0), Real(0), Real(0), Real(0), Real(0), Real(0)};
@@ -752,13 +908,13 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
     Number far = plain(env.laws[0].step_s) * fall + Number(1e-6);
 #endif
 #if PAIRED
-    int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES;
-    for (int k = behind; k < contact_count(p); k += LANES) {
+    const int start = contact_start(p);
+    EACH_OWNED(own.lanes, start, contact_count(p), k) {
         int contact = start + k, i = count;
 #else
     EACH_SLOT
     for (int k = 0; k < SLOTS; k++) {
-        int contact = k * LANES + env.lanes.lane;
+        int contact = k * LANES + own.lanes.lane;
 #if LISTED
         int i = count;
 #else
@@ -769,8 +925,8 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
         if (contact >= CONTACTS) continue;
 #endif
 #if HELD
-        Vec held = env.arms[k];
-        Real radius = env.radii[k];
+        Vec held = own.arms[k];
+        Real radius = own.radii[k];
 #else
         long long row = env.geometry + 4LL * problem.spheres[contact];
         Vec held = problem.geometry.vector(row) - env.constants[a].com;
@@ -797,33 +953,33 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, int p, c
 #endif
 #if LISTED
             list[i].slot = contact / LANES;
-            list[i].impulse = env.before[contact / LANES];
+            list[i].impulse = own.before[contact / LANES];
 #endif
         }
 #if !LISTED
         list[i].on = touches;
-        list[i].impulse = env.before[i];
+        list[i].impulse = own.before[i];
 #endif
     }
-    if (!env.lanes.any(count > first)) return;
-    moments = sum_rows(env.lanes, moments);
+    if (!own.lanes.any(count > first)) return;
+    moments = sum_rows(own.lanes, moments);
 #if PATCHES
     if (area_start(p) >= 0) {
-        share_by_area(env.lanes, moments, motion, list, weights, first, count);
+        share_by_area(own.lanes, moments, motion, list, weights, first, count);
     } else
 #endif
     EACH_CONTACT(list, first, count) share_out(list[i], crowd(moments, motion, list[i]), weights[i]);
 #if SURFACE
     Real total = Real(0);
     EACH_CONTACT(list, first, count) total += weights[i];
-    total = env.lanes.sum(total);
+    total = own.lanes.sum(total);
     EACH_CONTACT(list, first, count) surface(list[i], env.laws[0], motion, env.bodies[a].position, weights[i], total);
 #endif
 }
 
 // Finds the contacts of a step and their impulses, and adds these to the bodies' velocities and angular momenta.
-INLINE void collide(const Problem& problem, Environment& env, const Mat* rotations, Motion* motions, Vec* velocities,
-                    Vec* spins) {
+INLINE void collide(const Problem& problem, Environment& env, Own& own, const Mat* rotations, Motion* motions,
+                    Vec* velocities, Vec* spins) {
 #if HOST && LANES == 1 && SLOTS > 2048
     static thread_local Contact list[SLOTS];  // too large for a stack
     static thread_local Real weights[SLOTS];
@@ -833,100 +989,174 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
 #endif
     int count = 0;
 #if PAIRED
-    int groups[BODIES] = {}, ends[PAIR_ROOM], loaded = 0;
+    ROOM(int, groups, BODIES, env.room);
+    DIVIDED(own.lanes, b, BODIES) groups[b] = 0;
+#if !LINKS
+    int ends[PAIR_ROOM], loaded = 0;
+#endif
+#if SHARED
+    DIVIDED(own.lanes, p, PAIRS) {
+        Reach reach;
+        env.room.near[p] = pair_b(p) >= 0 && may_touch(env, p, rotations, motions, reach);
+        env.room.limits[p] = reach.limit;
+        env.room.nears[p] = reach.near;
+        env.room.touched[p] = false;
+    }
+    own.lanes.sync();
+#endif
+#if QUEUED
+    Candidates queue;
+    queue.few = queue.many = 0;
+#endif
+    EACH_PAIR
     for (int p = 0; p < PAIRS; p++) {
         int a = pair_a(p), b = pair_b(p), touching = 0;
         if (b >= 0) {
-            touching = touch_pair(problem, env, p, rotations, motions, list, weights, count);
+#if SHARED
+            if (!own.lanes.any(env.room.near[p])) continue;
+#endif
+#if QUEUED
+            queue_pair(problem, env, own, p, rotations, motions, queue);
+#else
+            touching = touch_pair(problem, env, own, p, rotations, motions, list, weights, count);
+#endif
 #if FIXED
         } else if (b < -1) {
-            touching = touch_surface(problem, env, p, rotations, motions, list, weights, count);
+            touching = touch_surface(problem, env, own, p, rotations, motions, list, weights, count);
 #endif
-        } else if (env.lanes.any(near_ground(env, a, motions[a]))) {
+        } else if (own.lanes.any(near_ground(env, a, motions[a]))) {
 #if LINKS
             if (body_link(a) >= 0) {
-                touching = touch_plane_link(problem, env, p, rotations, motions, list, weights, count);
+                touching = touch_plane_link(problem, env, own, p, rotations, motions, list, weights, count);
             } else
 #endif
             {
             touching = -count;
-            touch_plane(problem, env, p, rotations[a], motions[a], list, weights, count);
+            touch_plane(problem, env, own, p, rotations[a], motions[a], list, weights, count);
             touching += count;
             }
         }
-        if (env.lanes.any(touching > 0) && env.lanes.sum(Number(touching)) > Number(0)) {
+#if SHARED
+        if (touching > 0) env.room.touched[p] = true;
+#else
+        if (own.lanes.any(touching > 0) && own.lanes.sum(Number(touching)) > Number(0)) {
             groups[group_of(a)]++;
             if (b >= 0 && group_of(b) >= 0) groups[group_of(b)]++;
 #if !LINKS
             loaded++;  // `Load` has no share of the joints of chains
 #endif
         }
+#endif
+#if !LINKS
         ends[p] = count;
+#endif
     }
+#if QUEUED
+    const int before_queue = count;
+    KEEP_LOOP
+    for (int part = 0; part < 2; part++) {
+        KEEP_LOOP
+        for (int i = part ? SLOTS - queue.many : 0; i < (part ? SLOTS : queue.few); i++) {
+            int p = queue.slots[i] >> 16, k = queue.slots[i] & 0xffff;
+            Parting parting;
+            int found = make_contact(problem, env, own, p, k, rotations, motions, env.room.limits[p],
+                                     env.room.nears[p], parting, list[count], weights[count]);
+            if (found == 2) env.room.touched[p] = true;
+            if (found > 0) count++;
+        }
+        own.lanes.sync();
+    }
+    if (own.lanes.any(count > before_queue)) {
+        share_out_pair(SHOWN_TO(own.lanes, env), list, weights, before_queue, count, motions);
+    }
+#endif
+#if SHARED
+    own.lanes.sync();
+    for (int p = 0; p < PAIRS && own.lanes.writes(); p++) {
+        if (!env.room.touched[p]) continue;
+        groups[group_of(pair_a(p))]++;
+        if (pair_b(p) >= 0 && group_of(pair_b(p)) >= 0) groups[group_of(pair_b(p))]++;
+    }
+    own.lanes.sync();
+#endif
     split(list, count, groups);
+#if !LINKS
     Pushed pushed[PAIR_ROOM];
-    if (!env.lanes.any(count > 0)) {
-        forget(env);
+#endif
+    if (!own.lanes.any(count > 0)) {
+        forget(own);
 #if LINKS
-        if (!env.lanes.any(env.chain.active)) return;
+        if (!own.lanes.any(env.chain.active)) return;
 #else
         return;
 #endif
     }
 #else
-    if (!env.lanes.any(near_ground(env, 0, motions[0]))) {
-        forget(env);
+    if (!own.lanes.any(near_ground(env, 0, motions[0]))) {
+        forget(own);
         return;
     }
     motions[0].inverse_inertia = turned(rotations[0], env.constants[0].inverse_inertia);
-    touch_plane(problem, env, 0, rotations[0], motions[0], list, weights, count);
-    if (!env.lanes.any(count > 0)) {
-        forget(env);
+    touch_plane(problem, env, own, 0, rotations[0], motions[0], list, weights, count);
+    if (!own.lanes.any(count > 0)) {
+        forget(own);
         return;
     }
 #endif
-    Vec free_velocities[BODIES], free_omegas[BODIES], linear[BODIES], angular[BODIES];
+#if !SHARED
+    Vec linear[BODIES], angular[BODIES];
+#endif
+    ROOM(Vec, free_velocities, BODIES, env.chain.room.free);
+    ROOM(Vec, free_omegas, BODIES, env.chain.room.free);
     EACH_BODY
-    for (int b = 0; b < BODIES; b++) {
+    DIVIDED(own.lanes, b, BODIES) {
         free_velocities[b] = motions[b].velocity;
         free_omegas[b] = motions[b].omega;
     }
 #if SURFACE
-    Real touching = Real(env.lanes.sum(Number(count)));
+    Real touching = Real(own.lanes.sum(Number(count)));
     const Sym& J = motions[0].inverse_inertia;
     Real across = reciprocal((J.xx + J.yy) * touching), about = reciprocal(J.zz * touching);
 #endif
     // warm start: the impulses of the previous step
-    int sweep = env.lanes.any(env.warm) ? -1 : 0;
+    int sweep = own.lanes.any(own.warm) ? -1 : 0;
 #if LINKS
     // a single iteration starts at zero
     if (problem.sweeps < 2) {
-        for (int k = 0; k < 3 * JOINTS; k++) env.chain.impulses[k] = Real(0);
+        DIVIDED(own.lanes, k, 3 * JOINTS) env.chain.impulses[k] = Real(0);
     }
-    if (env.lanes.any(env.chain.active)) sweep = -1;
-    // links that are touched in any environment of the warp, and the bodies that are no links or such ones
+    if (own.lanes.any(env.chain.active)) sweep = -1;
+#if SHARED
+    list_reached(env, own.lanes);
+#else
+    // links that are touched, and the bodies that are no links or such ones
     int reached[LINKS], reached_count = 0, touched[BODIES], touched_count = 0;
     for (int b = 0; b < BODIES; b++) {
         int l = body_link(b);
-        if (l >= 0 && !env.lanes.any(env.chain.known[l])) continue;
+        if (l >= 0 && !env.chain.known[l]) continue;
         if (l >= 0) reached[reached_count++] = l;
         touched[touched_count++] = b;
     }
 #endif
-#if PAIRED
+#endif
+#if PAIRED && !LINKS
     const int first_sweep = sweep;
-    const bool loads_count = env.lanes.any(loaded > 1);  // the whole warp takes part in the sums of `pushed_by`
+    const bool loads_count = own.lanes.any(loaded > 1);  // the whole warp takes part in the sums of `pushed_by`
     bool active[PAIR_ROOM];
-    for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) active[p] = env.lanes.any(ends[p] > first);
+    for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) active[p] = own.lanes.any(ends[p] > first);
 #endif
     do {
+#if SHARED
+        sweep_contacts(env, own.lanes, list, count, motions, sweep >= 0);
+        move_bodies(env, own.lanes, motions, spins, sweep >= 0, sweep + 1 >= problem.sweeps);
+#else
 #if LINKS
         for (int i = 0; i < touched_count; i++) linear[touched[i]] = angular[touched[i]] = none();
 #else
         EACH_BODY
         for (int b = 0; b < BODIES; b++) linear[b] = angular[b] = none();
 #endif
-#if PAIRED
+#if PAIRED && !LINKS
         if (loaded > 1 && sweep != first_sweep) {
             for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) {
                 if (!active[p]) continue;
@@ -934,6 +1164,8 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
                 aim_under_load(env.laws[pair_law(p)], list, first, ends[p], load, motions);
             }
         }
+#endif
+#if PAIRED
         for (int i = 0; i < count; i++) {
             Contact& c = list[i];
             if (sweep >= 0) c.impulse = swept(c, env.laws[0], relative_velocity(c, motions));
@@ -959,28 +1191,26 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
         }
 #endif
 #if LINKS
-        push_joints(env.chain);
+        push_joints(env.chain, own.lanes);
         for (int i = 0; i < reached_count; i++) {
             int l = reached[i], b = link_body[l];
-            Vec impulse = env.lanes.sum(linear[b]), moment = env.lanes.sum(angular[b]);
-            if (env.chain.known[l]) push_link(env.chain, l, impulse, moment);
+            push_link(env.chain, own.lanes, l, linear[b], angular[b]);
         }
-        if (sweep >= 0 && env.chain.active) sweep_joints(env.chain, env.laws[0].step_s);
+        if (sweep >= 0 && env.chain.active) sweep_joints(env.chain, own.lanes, env.laws[0].step_s);
         for (int i = 0; i < reached_count; i++) {
             int l = reached[i], b = link_body[l];
-            if (!env.chain.known[l]) continue;
             motions[b].velocity = free_velocities[b];
             motions[b].omega = free_omegas[b];
             gain(env.chain, l, motions[b].velocity, motions[b].omega);
         }
 #endif
-#if PAIRED
+#if PAIRED && !LINKS
         if (loads_count) {  // sums by pair, of which those by body are made without further exchanges
             for (int b = 0; b < BODIES; b++) linear[b] = angular[b] = none();
             for (int p = 0, first = 0; p < PAIRS; first = ends[p++]) {
                 if (!active[p]) continue;
                 int a = pair_a(p), b = pair_b(p);
-                pushed[p] = pushed_by(env, list, first, ends[p], b);
+                pushed[p] = pushed_by(own.lanes, list, first, ends[p], b);
                 linear[a] = linear[a] + pushed[p].linear;
                 angular[a] = angular[a] + pushed[p].angular_a;
                 if (b < 0) continue;
@@ -995,29 +1225,33 @@ INLINE void collide(const Problem& problem, Environment& env, const Mat* rotatio
         for (int b = 0; b < BODIES; b++) {
             if (!is_free(b)) continue;
             if (!loads_count) {
-                linear[b] = env.lanes.sum(linear[b]);
-                angular[b] = env.lanes.sum(angular[b]);
+                linear[b] = own.lanes.sum(linear[b]);
+                angular[b] = own.lanes.sum(angular[b]);
             }
             motions[b].velocity = free_velocities[b] + motions[b].inverse_mass * linear[b];
             motions[b].omega = free_omegas[b] + motions[b].inverse_inertia * angular[b];
         }
+#endif
     } while (++sweep < problem.sweeps);
-    keep(env, list, count, problem.sweeps);
+    keep(env, own, list, count, problem.sweeps);
     EACH_BODY
     for (int b = 0; b < BODIES; b++) {
-        if (!is_free(b)) continue;
-        velocities[b] = motions[b].velocity;
+        if (!is_free(b) || !own.lanes.writes()) continue;
+        velocities[FREE(b)] = motions[b].velocity;
+#if !SHARED
         spins[b] = spins[b] + angular[b];
+#endif
     }
+    own.lanes.sync();
 #if RECORD
 #if PAIRED
-    for (int i = 0; i < count; i++) note(env.tallies[list[i].slot], list[i], env.laws[0], env.bodies[list[i].a].position);
+    for (int i = 0; i < count; i++) note(own.tallies[list[i].slot], list[i], env.laws[0], env.bodies[list[i].a].position);
 #elif LISTED
-    for (int i = 0; i < count; i++) note(env.tallies[list[i].slot], list[i], env.laws[0], env.bodies[0].position);
+    for (int i = 0; i < count; i++) note(own.tallies[list[i].slot], list[i], env.laws[0], env.bodies[0].position);
 #else
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
-        if (list[i].on) note(env.tallies[i], list[i], env.laws[0], env.bodies[0].position);
+        if (list[i].on) note(own.tallies[i], list[i], env.laws[0], env.bodies[0].position);
     }
 #endif
 #endif

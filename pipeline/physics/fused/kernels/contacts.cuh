@@ -58,7 +58,7 @@ INLINE void add_mobility(const Motion& m, Vec arm, Vec normal, Real& inverse_mas
     Vec turn = cross(arm, normal);
     inverse_mass += m.inverse_mass + dot(turn, m.inverse_inertia * turn);
     trace_of += mobility_trace(m, arm);
-    for (int k = 0; k < m.depth; k++) {
+    INNER for (int k = 0; k < m.depth; k++) {
         Vec moved = m.columns[k].linear + cross(m.columns[k].turning, arm);
         inverse_mass += square(dot(normal, moved));
         trace_of += dot(moved, moved);
@@ -69,7 +69,7 @@ INLINE void add_mobility(const Motion& m, Vec arm, Vec normal, Real& inverse_mas
 INLINE void response_of(const Motion& m, Vec normal, Vec turn, Vec& linear, Vec& angular) {
     linear = m.inverse_mass * normal;
     angular = m.inverse_inertia * turn;
-    for (int k = 0; k < m.depth; k++) {
+    INNER for (int k = 0; k < m.depth; k++) {
         Real along = dot(m.columns[k].linear, normal) + dot(m.columns[k].turning, turn);
         linear = linear + along * m.columns[k].linear;
         angular = angular + along * m.columns[k].turning;
@@ -248,18 +248,32 @@ INLINE Number plain_radius(const Union& spheres, int i) {
     return spheres.geometry.value[spheres.first + 4LL * i + 3];
 }
 
+// Centre and radius of a sphere; for lanes that share an environment by one load.
+INLINE AlignedRow row_of(const Number* sphere) {
+#if HOST || !SHARED
+    AlignedRow row = {sphere[0], sphere[1], sphere[2], sphere[3]};
+    return row;
+#else
+    return *reinterpret_cast<const AlignedRow*>(sphere);
+#endif
+}
+
 // Whether a sphere, the square of whose distance is given, has a gap below `limit`, without a square root.
 INLINE bool below(Number far2, Number radius, Number limit) {
     Number reach = limit + radius;
     return reach > Number(0) && far2 < reach * reach;
 }
 
-// Squared distances of a group of spheres, whose computation does not wait for that of the others.
+// Squared distances and radii of a group of spheres, whose computation does not wait for that of the others.
 const int AT_ONCE = 4;
-INLINE void squares_to(const Union& spheres, int first, const Number* point, Number* squares) {
+INLINE void squares_to(const Union& spheres, int first, const Number* point, Number* squares, Number* radii) {
     SPREAD
     for (int k = 0; k < AT_ONCE; k++) {
-        squares[k] = square_to(spheres, first + k < spheres.count ? first + k : first, point);
+        int i = first + k < spheres.count ? first + k : first;
+        AlignedRow s = row_of(spheres.geometry.value + spheres.first + 4LL * i);
+        Number x = point[0] - s.a, y = point[1] - s.b, z = point[2] - s.c;
+        squares[k] = x * x + y * y + z * z;
+        radii[k] = s.d;
     }
 }
 
@@ -270,14 +284,17 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     const Number width = Number(SMOOTHING_M);
     Number point[3] = {plain(at.x), plain(at.y), plain(at.z)};
     nearest = Number(1e30);
-    Number squares[AT_ONCE];
+    Number squares[AT_ONCE], radii[AT_ONCE];
     for (int first = 0; first < spheres.count; first += AT_ONCE) {
-        squares_to(spheres, first, point, squares);
+        squares_to(spheres, first, point, squares, radii);
         SPREAD
         for (int k = 0; k < AT_ONCE; k++) {
+#if HOST || !SHARED || !SINGLE
             if (first + k >= spheres.count) break;
-            Number radius = plain_radius(spheres, first + k);
-            if (below(squares[k], radius, nearest)) nearest = root(squares[k]) - radius;
+            if (below(squares[k], radii[k], nearest)) nearest = root(squares[k]) - radii[k];
+#else
+            nearest = lesser(nearest, root(squares[k]) - radii[k]);  // branches would part the lanes
+#endif
         }
     }
     if (nearest - width > limit) return false;
@@ -286,11 +303,11 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     int members[most], found = 0;
     Number gaps[most];
     for (int first = 0; first < spheres.count; first += AT_ONCE) {
-        squares_to(spheres, first, point, squares);
+        squares_to(spheres, first, point, squares, radii);
         SPREAD
         for (int k = 0; k < AT_ONCE; k++) {
             if (first + k >= spheres.count) break;
-            Number radius = plain_radius(spheres, first + k);
+            Number radius = radii[k];
             if (!below(squares[k], radius, nearest + width)) continue;
             Number gap = root(squares[k]) - radius - nearest;
             if (!(gap < width)) continue;
@@ -531,6 +548,26 @@ INLINE Vec relative_velocity(const Contact& c, const Motion* bodies) {
     return velocity;
 }
 
+#if SHARED
+// Both bodies of a contact in one number.
+INLINE int bodies_of(const Contact& c) { return c.a << 16 | (c.b & 0xffff); }
+#endif
+
+// What a contact with a unit impulse along its normal does to both bodies: velocity of a relative to b, and rotations.
+INLINE void unit_response(const Contact& c, const Motion* bodies, Vec& normal, Vec& turn_a, Vec& turn_b) {
+#if LINKS
+    Vec other = none();
+    response_of(bodies[c.a], c.normal, cross(c.arm, c.normal), normal, turn_a);
+    if (c.b >= 0) response_of(bodies[c.b], c.normal, cross(c.arm_b, c.normal), other, turn_b);
+    normal = normal + other;
+#else
+    normal = c.normal;
+    turn_a = bodies[c.a].inverse_inertia * cross(c.arm, normal);
+    if (c.b >= 0) turn_b = bodies[c.b].inverse_inertia * cross(c.arm_b, normal);
+#endif
+}
+
+#if !SHARED
 // Distributes the effective mass among the touching contacts of a pair: those from `first` on in every lane's list.
 __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* weights, int first, int end,
                                const Motion* bodies) {
@@ -543,16 +580,7 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
             Real weight = Real(0);
             if (source == lanes.lane && j < theirs) {
                 const Contact& c = list[first + j];
-#if LINKS
-                Vec other = none();
-                response_of(bodies[c.a], c.normal, cross(c.arm, c.normal), normal, turn_a);
-                if (c.b >= 0) response_of(bodies[c.b], c.normal, cross(c.arm_b, c.normal), other, turn_b);
-                normal = normal + other;
-#else
-                normal = c.normal;
-                turn_a = bodies[c.a].inverse_inertia * cross(c.arm, normal);
-                if (c.b >= 0) turn_b = bodies[c.b].inverse_inertia * cross(c.arm_b, normal);
-#endif
+                unit_response(c, bodies, normal, turn_a, turn_b);
                 weight = weights[first + j] * c.stop_n;
             }
             normal = lanes.from(normal, source);
@@ -575,4 +603,41 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
     }
     for (int i = first; i < end; i++) share_out(list[i], list[i].stop_n * totals[i], weights[i]);
 }
+#else
+// The same; contacts may be of several pairs of bodies. In each round every lane shows one contact.
+__device__ void share_out_pair(const Lanes& lanes, ContactRoom& room, Contact* list, const Real* weights, int first,
+                               int end, const Motion* bodies) {
+    Real totals[SLOTS];
+    INNER for (int i = first; i < end; i++) totals[i] = Real(0);
+    KEEP_LOOP
+    for (int j = first; lanes.any(j < end); j++) {
+        room.bodies[lanes.lane] = -1;
+        if (j < end) {
+            const Contact& c = list[j];
+            Vec normal = none(), turn_a = none(), turn_b = none();
+            unit_response(c, bodies, normal, turn_a, turn_b);
+            room.first[lanes.lane] = normal;
+            room.second[lanes.lane] = turn_a;
+            room.third[lanes.lane] = turn_b;
+            room.weight[lanes.lane] = weights[j] * c.stop_n;
+            room.bodies[lanes.lane] = bodies_of(c);
+        }
+        lanes.sync();
+        KEEP_LOOP
+        for (int shown = 0; shown < LANES; shown++) {
+            if (room.bodies[shown] < 0) continue;
+            KEEP_LOOP
+            for (int i = first; i < end; i++) {
+                const Contact& c = list[i];
+                if (bodies_of(c) != room.bodies[shown]) continue;
+                Real along = dot(c.normal, room.first[shown]) + dot(cross(c.arm, c.normal), room.second[shown]);
+                if (c.b >= 0) along += dot(cross(c.arm_b, c.normal), room.third[shown]);
+                totals[i] += room.weight[shown] * along * along;
+            }
+        }
+        lanes.sync();
+    }
+    INNER for (int i = first; i < end; i++) share_out(list[i], list[i].stop_n * totals[i], weights[i]);
+}
+#endif
 #endif

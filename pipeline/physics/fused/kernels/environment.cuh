@@ -60,10 +60,39 @@ struct Tally {  // sums over the contacts since the last frame
 #endif
 };
 
-struct Environment {
+struct Own {  // what each lane of an environment keeps for itself
+    Lanes lanes;
+#if HELD
+    Vec arms[SLOTS];  // of this lane's spheres, from the centre of mass, body axes
+    Real radii[SLOTS];
+#endif
+    // impulses of this lane's contacts in the previous step: ground contacts in the kernel's frame, others along
+    // normal and tangents
+    Vec before[SLOTS];
+    bool warm;  // whether any of them is not zero
+#if PAIRED
+    int kept[SLOTS], kept_count;  // the slots that may not be zero
+#endif
+#if RECORD
+    Tally tallies[SLOTS];
+#endif
+};
+
+#if SHARED
+// Where the lanes of an environment work together within a step.
+struct StepRoom {
+    Mat rotations[BODIES];
+    Motion motions[BODIES];
+    Vec starts[FREES], velocities[FREES], spins[FREES];
+    Number limits[PAIR_ROOM], nears[PAIR_ROOM];  // see `Reach`
+    bool near[PAIR_ROOM], touched[PAIR_ROOM];    // pairs that may touch, and those that do
+    int groups[BODIES];
+};
+#endif
+
+struct Common {  // what the lanes of an environment have in common
     long long index, geometry, steps, drives, surfaces;
     int drive_last;
-    Lanes lanes;
     Vec gravity;
     Real ground;
     Law laws[LAWS];
@@ -79,26 +108,24 @@ struct Environment {
 #if LINKS
     Chain chain;
 #endif
-#if HELD
-    Vec arms[SLOTS];  // of this lane's spheres, from the centre of mass, body axes
-    Real radii[SLOTS];
-#endif
-    // impulses of this lane's contacts in the previous step: ground contacts in the kernel's frame, others along
-    // normal and tangents
-    Vec before[SLOTS];
-    bool warm;  // whether any of them is not zero
-#if PAIRED
-    int kept[SLOTS], kept_count;  // the slots that may not be zero
-#endif
 #if HULLS
     Number parted[PAIR_ROOM][3];  // of each pair, an axis that parted its hulls in an earlier step; zero for none
 #endif
-#if RECORD
-    Tally tallies[SLOTS];
+#if SHARED
+    StepRoom room;
 #endif
 };
 
-INLINE void load(const Problem& problem, Environment& env) {
+#if SHARED
+typedef Common Environment;
+static_assert(sizeof(Environment) <= SHARED_BYTES, "shared_bytes of structure.py counts less than there is");
+#else
+struct Environment : Common {  // one object, as the compiler allots registers by the order of what is in it
+    Own own;
+};
+#endif
+
+INLINE void load(const Problem& problem, Environment& env, Own& own) {
     const Input& table = problem.table;
     long long at = env.index * TABLE_WIDTH;
     env.gravity = table.vector(at);
@@ -153,12 +180,14 @@ INLINE void load(const Problem& problem, Environment& env) {
     at += 22;
 #endif
 #if LINKS
-    at = load_chain(table, at, env.chain);
+    at = load_chain(table, at, own.lanes, env.chain);
 #endif
+    const long long bodies = at;
     EACH_BODY
-    for (int b = 0; b < BODIES; b++) {
+    DIVIDED(own.lanes, b, BODIES) {
         Body& body = env.bodies[b];
         Constants& c = env.constants[b];
+        at = bodies + 23 * b;
         c.inverse_mass = table.at(at);
         Sym inertia = {table.at(at + 1), table.at(at + 2), table.at(at + 3),
                        table.at(at + 4), table.at(at + 5), table.at(at + 6)};
@@ -169,7 +198,6 @@ INLINE void load(const Problem& problem, Environment& env) {
         body.quat = quat;
         body.velocity = table.vector(at + 17);
         body.spin = table.vector(at + 20);
-        at += 23;
         c.reach = Number(0);
 #if PAIRED
         for (int k = 0; k < 3; k++) {
@@ -191,23 +219,24 @@ INLINE void load(const Problem& problem, Environment& env) {
         env.cursors[b] = 0;
     }
     EACH_SLOT
-    for (int i = 0; i < SLOTS; i++) env.before[i] = none();
-    env.warm = false;
+    for (int i = 0; i < SLOTS; i++) own.before[i] = none();
+    own.warm = false;
 #if PAIRED
-    env.kept_count = 0;
+    own.kept_count = 0;
 #endif
 #if HULLS
     for (int p = 0; p < PAIRS; p++) {
         for (int k = 0; k < 3; k++) env.parted[p][k] = Number(0);
     }
 #endif
+    own.lanes.sync();
 #if HELD
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
-        int contact = i * LANES + env.lanes.lane;
+        int contact = i * LANES + own.lanes.lane;
         long long row = env.geometry + 4LL * (contact < CONTACTS ? problem.spheres[contact] : 0);
-        env.arms[i] = problem.geometry.vector(row) - env.constants[0].com;
-        env.radii[i] = problem.geometry.at(row + 3);
+        own.arms[i] = problem.geometry.vector(row) - env.constants[0].com;
+        own.radii[i] = problem.geometry.at(row + 3);
     }
 #endif
 }
@@ -215,12 +244,13 @@ INLINE void load(const Problem& problem, Environment& env) {
 #if CARRIED
 // Restores the state at the end of the last launch, if there was one since the last reset: position, orientation,
 // velocity and spin of each body, the impulses of this lane's contacts, whether any is not zero, and values, speeds and
-// impulses of the joints. Every lane has a copy, so that lanes need no synchronisation.
-INLINE void resume(const Problem& problem, Environment& env) {
-    const Number* row = problem.carried + (env.index * LANES + env.lanes.lane) * CARRIED_WIDTH;
+// impulses of the joints. There is a row of every lane, so that launches need no synchronisation.
+INLINE void resume(const Problem& problem, Environment& env, Own& own) {
+    const Number* row = problem.carried + (env.index * LANES + own.lanes.lane) * CARRIED_WIDTH;
     if (*row++ == Number(0)) return;
     EACH_BODY
     for (int b = 0; b < BODIES; b++, row += 13) {
+        if (!own.lanes.writes()) continue;
         Body& body = env.bodies[b];
         body.position = vec(row[0], row[1], row[2]);
         Quat quat = {row[3], row[4], row[5], row[6]};
@@ -229,26 +259,27 @@ INLINE void resume(const Problem& problem, Environment& env) {
         body.spin = vec(row[10], row[11], row[12]);
     }
     EACH_SLOT
-    for (int i = 0; i < SLOTS; i++) env.before[i] = vec(row[3 * i], row[3 * i + 1], row[3 * i + 2]);
+    for (int i = 0; i < SLOTS; i++) own.before[i] = vec(row[3 * i], row[3 * i + 1], row[3 * i + 2]);
     row += 3 * SLOTS;
-    env.warm = *row++ > Number(0);
+    own.warm = *row++ > Number(0);
 #if PAIRED
-    for (int i = 0; i < SLOTS; i++) env.kept[i] = i;
-    env.kept_count = SLOTS;
+    for (int i = 0; i < SLOTS; i++) own.kept[i] = i;
+    own.kept_count = SLOTS;
 #endif
 #if LINKS
-    for (int j = 0; j < JOINTS; j++, row += 5) {
+    for (int j = 0; j < JOINTS && own.lanes.writes(); j++, row += 5) {
         env.chain.values[j] = row[0];
         env.chain.speeds[j] = row[1];
         for (int k = 0; k < 3; k++) env.chain.impulses[3 * j + k] = row[2 + k];
     }
 #endif
+    own.lanes.sync();
 }
 
 // Stores the state that `resume` reads in the next launch.
-INLINE void suspend(const Problem& problem, const Environment& env) {
-    if (env.lanes.idle) return;
-    Number* row = problem.carried + (env.index * LANES + env.lanes.lane) * CARRIED_WIDTH;
+INLINE void suspend(const Problem& problem, const Environment& env, const Own& own) {
+    if (own.lanes.idle) return;
+    Number* row = problem.carried + (env.index * LANES + own.lanes.lane) * CARRIED_WIDTH;
     *row++ = Number(1);
     EACH_BODY
     for (int b = 0; b < BODIES; b++, row += 13) {
@@ -260,12 +291,12 @@ INLINE void suspend(const Problem& problem, const Environment& env) {
     }
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
-        row[3 * i] = env.before[i].x;
-        row[3 * i + 1] = env.before[i].y;
-        row[3 * i + 2] = env.before[i].z;
+        row[3 * i] = own.before[i].x;
+        row[3 * i + 1] = own.before[i].y;
+        row[3 * i + 2] = own.before[i].z;
     }
     row += 3 * SLOTS;
-    *row++ = env.warm ? Number(1) : Number(0);
+    *row++ = own.warm ? Number(1) : Number(0);
 #if LINKS
     for (int j = 0; j < JOINTS; j++, row += 5) {
         row[0] = env.chain.values[j];

@@ -5,7 +5,8 @@ static void* work(void* shared) {
     for (int first; (first = __atomic_fetch_add(&queue.next, queue.share, __ATOMIC_RELAXED)) < queue.environments;) {
         for (int index = first; index < first + queue.share && index < queue.environments; index++) {
             Lanes lanes = {0, false};
-            roll(*queue.problem, index, lanes);
+            Environment env;
+            roll(*queue.problem, index, lanes, env);
         }
     }
     return nullptr;

@@ -1,14 +1,16 @@
-INLINE void step(const Problem& problem, Environment& env, Real time_after) {
-    Mat rotations[BODIES];
-    Motion motions[BODIES];
-    Vec starts[BODIES], velocities[BODIES], spins[BODIES];
+INLINE void step(const Problem& problem, Environment& env, Own& own, Real time_after) {
+    const Lanes& lanes = own.lanes;
+    ROOM(Mat, rotations, BODIES, env.room);
+    ROOM(Motion, motions, BODIES, env.room);
+    ROOM(Vec, starts, FREES, env.room);
+    ROOM(Vec, velocities, FREES, env.room);
+    ROOM(Vec, spins, FREES, env.room);
     EACH_BODY
-    for (int b = 0; b < BODIES; b++) {
+    DIVIDED(lanes, b, BODIES) {
         const Body& body = env.bodies[b];
         const Constants& c = env.constants[b];
         rotations[b] = matrix(body.quat);
-        velocities[b] = body.velocity;
-        spins[b] = starts[b] = body.spin;
+        Vec velocity = body.velocity, start = body.spin, spin = body.spin;
         motions[b].omega = body.spin;
         motions[b].inverse_mass = Real(0);
         motions[b].inverse_inertia = no_inertia();
@@ -17,35 +19,44 @@ INLINE void step(const Problem& problem, Environment& env, Real time_after) {
         motions[b].depth = 0;
 #endif
         if (is_free(b)) {
-            starts[b] = c.inverse_inertia * transposed(rotations[b], body.spin);
-            motions[b].omega = rotations[b] * starts[b];
-            velocities[b] = body.velocity + env.laws[0].step_s * env.gravity;
+            start = c.inverse_inertia * transposed(rotations[b], body.spin);
+            motions[b].omega = rotations[b] * start;
+            velocity = body.velocity + env.laws[0].step_s * env.gravity;
 #if EFFECTS
-            apply(problem, env, b, rotations[b], motions[b].omega, velocities[b], spins[b]);
-            motions[b].omega = rotations[b] * (c.inverse_inertia * transposed(rotations[b], spins[b]));
+            apply(problem, env, lanes, b, rotations[b], motions[b].omega, velocity, spin);
+            motions[b].omega = rotations[b] * (c.inverse_inertia * transposed(rotations[b], spin));
 #endif
             motions[b].inverse_mass = c.inverse_mass;
 #if PAIRED
             motions[b].inverse_inertia = turned(rotations[b], c.inverse_inertia);
 #endif
         }
-        motions[b].velocity = velocities[b];
+        motions[b].velocity = velocity;
+        if (SHARED && !is_free(b)) continue;
+        velocities[FREE(b)] = velocity;
+        starts[FREE(b)] = start;
+        spins[FREE(b)] = spin;
     }
+    lanes.sync();
 #if LINKS
-    kick(problem, env, time_after, rotations, motions, velocities);
+    kick(problem, env, lanes, time_after, rotations, motions);
 #endif
 #if PAIRS || LINKS
-    collide(problem, env, rotations, motions, velocities, spins);
+    collide(problem, env, own, rotations, motions, velocities, spins);
 #endif
+    lanes.sync();
     EACH_BODY
-    for (int b = 0; b < BODIES; b++) {
-        if (is_free(b)) advance(env.bodies[b], env.constants[b], starts[b], velocities[b], spins[b], env.laws[0].step_s);
+    DIVIDED(lanes, b, BODIES) {
+        if (is_free(b)) {
+            int f = FREE(b);
+            advance(env.bodies[b], env.constants[b], starts[f], velocities[f], spins[f], env.laws[0].step_s);
+        }
 #if DRIVEN
         if (drive_number(b) >= 0 && body_link(b) < 0) drive(problem, env, b, time_after);
 #endif
     }
 #if LINKS
-    settle(problem, env, time_after);
+    settle(problem, env, lanes, time_after);
 #endif
 }
 
@@ -57,10 +68,10 @@ INLINE void write_vector(const Problem& problem, long long at, Vec v) {
 }
 
 // Writes position, quaternion, velocity (of the body frame's origin) and angular velocity (body frame).
-INLINE void write_frame(const Problem& problem, const Environment& env, int frame) {
-    if (env.lanes.lane != 0 || env.lanes.idle) return;
+INLINE void write_frame(const Problem& problem, const Environment& env, const Lanes& lanes, int frame) {
+    if ((!SHARED && lanes.lane != 0) || lanes.idle) return;
     EACH_BODY
-    for (int b = 0; b < BODIES; b++) {
+    DIVIDED(lanes, b, BODIES) {
         const Body& body = env.bodies[b];
         const Constants& c = env.constants[b];
         Mat R = matrix(body.quat);
@@ -99,14 +110,17 @@ INLINE void write_label(const Problem& problem, Environment& env, int frame, int
 }
 
 // Writes the impulse of each contact since the last frame and its present geometry, and resets the sums.
-INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
-    if (env.lanes.idle) return;
+INLINE void write_labels(const Problem& problem, Environment& env, Own& own, int frame) {
+    if (own.lanes.idle) return;
     Mat rotations[BODIES];
     EACH_BODY
     for (int b = 0; b < BODIES; b++) rotations[b] = matrix(env.bodies[b].quat);
     EACH_PAIR
     for (int p = 0; p < PAIRS; p++) {
-        int start = contact_start(p), behind = (env.lanes.lane - start % LANES + LANES) % LANES, a = pair_a(p);
+        int start = contact_start(p), a = pair_a(p);
+#if !QUEUED
+        int behind = (own.lanes.lane - start % LANES + LANES) % LANES;
+#endif
 #if FIXED
         Searched searched;
         searched.sphere = -1;
@@ -119,7 +133,12 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
 #endif
         EACH_SLOT
         for (int s = 0; s < SLOTS; s++) {
+#if QUEUED
+            int k = owned(own.lanes, start / LANES + s) - start;
+            if (k < 0) continue;
+#else
             int k = behind + s * LANES;
+#endif
             if (k >= contact_count(p)) continue;
             Vec normal = vec(Real(0), Real(0), Real(1)), point;
             Real gap;
@@ -173,9 +192,9 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
                 gap = point.z - env.ground;
             }
 #if PAIRED
-            Tally& tally = env.tallies[(start + k) / LANES];
+            Tally& tally = own.tallies[(start + k) / LANES];
 #else
-            Tally& tally = env.tallies[s];
+            Tally& tally = own.tallies[s];
 #endif
 #if PAIRED
             // at the frame, the slot may have another contact than that which acted
@@ -201,49 +220,57 @@ INLINE void write_labels(const Problem& problem, Environment& env, int frame) {
 }
 #endif
 
-INLINE void write(const Problem& problem, Environment& env, int frame) {
-    write_frame(problem, env, frame);
+INLINE void write(const Problem& problem, Environment& env, Own& own, int frame) {
+    write_frame(problem, env, own.lanes, frame);
 #if RECORD
-    write_labels(problem, env, frame);
+    write_labels(problem, env, own, frame);
 #endif
 }
 
 // Simulates one environment; called by all of its lanes.
-INLINE void roll(const Problem& problem, int index, Lanes lanes) {
-    Environment env;
+INLINE void roll(const Problem& problem, int index, Lanes lanes, Environment& env) {
+#if SHARED
+    Own own;
+#else
+    Own& own = env.own;
+#endif
+    own.lanes = lanes;
+    // all lanes write the same numbers
     env.index = index;
-    env.lanes = lanes;
     env.steps = index * problem.steps_stride;
     env.geometry = index * problem.geometry_stride;
     env.surfaces = index * problem.surface_stride;
     env.drives = index * problem.drive_stride;
     env.drive_last = index * problem.drive_last_stride;
-    load(problem, env);
+    lanes.sync();
+    load(problem, env, own);
 #if CARRIED
-    resume(problem, env);
+    resume(problem, env, own);
 #endif
 #if DRIVEN
     for (int b = 0; b < BODIES; b++) {
-        if (drive_number(b) >= 0) drive(problem, env, b, problem.steps.at(env.steps + 3));
+        if (drive_number(b) >= 0 && lanes.writes()) drive(problem, env, b, problem.steps.at(env.steps + 3));
     }
+    lanes.sync();
 #endif
 #if LINKS
-    spread(env);
+    spread(env, lanes);
 #endif
 #if RECORD
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
         Tally zero = {};
-        env.tallies[i] = zero;
+        own.tallies[i] = zero;
     }
 #endif
-    write(problem, env, 0);
+    write(problem, env, own, 0);
     KEEP_LOOP
     for (int frame = 1; frame < problem.frame_count; frame++) {
         long long row = env.steps + (long long)STEP_WIDTH * (frame - 1);
         Real step_s = problem.steps.at(row), inverse_step = reciprocal(step_s);
         EACH_LAW
         for (int l = 0; l < LAWS; l++) {
+            if (!lanes.writes()) continue;
             Law& law = env.laws[l];
             law.step_s = step_s;
             law.inverse_step = inverse_step;
@@ -254,14 +281,15 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
         Surface& surface = env.laws[0].surface;
         damp(surface, step_s, Real(0), surface.stiffness, surface.damping);
 #endif
+        lanes.sync();
         Real start = problem.steps.at(row + 3);
         int substeps = problem.substeps[frame - 1];
         KEEP_LOOP
-        for (int s = 1; s <= substeps; s++) step(problem, env, start + Number(s) * step_s);
-        write(problem, env, frame);
+        for (int s = 1; s <= substeps; s++) step(problem, env, own, start + Number(s) * step_s);
+        write(problem, env, own, frame);
     }
 #if CARRIED
-    suspend(problem, env);
+    suspend(problem, env, own);
 #endif
 }
 
@@ -282,9 +310,16 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes) {
 
 #if !HOST
 extern "C" __global__ void __launch_bounds__(THREADS) rollout(PARAMETERS) {
+#if SHARED
+    __shared__ Environment copies[THREADS / LANES];
+    Environment& env = copies[threadIdx.x / LANES];
+    copy_lists();
+#else
+    Environment env;
+#endif
     Problem problem = PROBLEM;
     int thread = blockIdx.x * THREADS + threadIdx.x, index = thread / LANES;
     Lanes lanes = {(int)threadIdx.x % LANES, index >= environments};
-    roll(problem, lanes.idle ? environments - 1 : index, lanes);
+    roll(problem, lanes.idle ? environments - 1 : index, lanes, env);
 }
 #endif

@@ -917,5 +917,6 @@ def test_threads_of_an_environment() -> None:
     assert lanes_for(8, 10**6, single=False, dual=True, paired=False) == 8
     assert lanes_for(500, 1, single=True, dual=False, paired=True) == 32
     assert lanes_for(0, 1, single=True, dual=False, paired=False) == 1
-    hands = [lanes_for(1245, count, single=True, dual=False, paired=True, chained=True) for count in (1, 4096, 10**6)]
-    assert hands == [32, 4, 1]
+    hands = [lanes_for(1245, count, single=True, dual=False, paired=True, links=17) for count in (1, 4096, 10**6)]
+    assert hands == [32, 8, 8]
+    assert [lanes_for(40, count, single=True, dual=False, paired=True, links=3) for count in (128, 10**6)] == [32, 1]

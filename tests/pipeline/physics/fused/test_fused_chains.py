@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,9 @@ from cgwm.pipeline.physics.chain_state import with_joints
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.fused import simulate_fused
-from cgwm.pipeline.physics.fused.packing import reason_against
+from cgwm.pipeline.physics.fused.packing import pack, reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
+from cgwm.pipeline.physics.fused.structure import SHARED_BYTES, Structure
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.runtime import kernel_build
@@ -126,7 +128,7 @@ def test_derivatives_are_those_of_the_torch_engine(fused: Fused) -> None:
 
     point = torch.zeros(1, 7, dtype=F64)
     value, jacobian = batched_jacobian(moved(simulate), point)
-    found, derivative = batched_jacobian(moved(fused), point)
+    found, derivative = batched_jacobian(moved(partial(fused, lanes=8)), point)
     np.testing.assert_allclose(found.cpu(), value, atol=1e-10)
     assert (jacobian.abs().amax((0, 1)) > 1e-6).all()
     np.testing.assert_allclose(derivative.cpu(), jacobian, atol=1e-8 * float(jacobian.abs().max()))
@@ -200,6 +202,23 @@ def test_two_chains_touch_each_other(fused: Fused) -> None:
     )
     for name in POSES:
         np.testing.assert_allclose(getattr(found, name).cpu(), getattr(expected, name), atol=1e-8, err_msg=name)
+
+
+def long_chain(links: int) -> Structure:
+    """Return the structure of a chain of hinges, one below the other."""
+    names = [f"l{k}" for k in range(links)]
+    bodies = [link("base", 0.0), *(link(name, 0.02) for name in names)]
+    joints = [Joint.of(f"j{k}", "hinge", name, ["base", *names][k]) for k, name in enumerate(names)]
+    world = chained(Chain(name="arm", root="base", base="fixed", joints=tuple(joints)), *bodies)
+    return pack(world, still(links + 1), times(0.01), {}, False).structure
+
+
+def test_environments_of_a_block_are_as_many_as_its_memory_holds() -> None:
+    short, middle, endless = (long_chain(links) for links in (3, 10, 150))
+    assert [short.on_lanes(lanes).lanes for lanes in (1, 4, 32)] == [1, 4, 32]
+    assert [middle.on_lanes(lanes).lanes for lanes in (1, 4, 32)] == [1, 16, 32]
+    assert middle.on_lanes(4).block_bytes <= SHARED_BYTES < 4 * middle.on_lanes(4).shared_bytes
+    assert endless.on_lanes(32).lanes == 1 and not endless.on_lanes(32).shared
 
 
 def test_a_hand_of_160_spheres_and_two_objects_of_250_stay_in_the_kernel() -> None:
