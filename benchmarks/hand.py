@@ -33,7 +33,7 @@ from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant
 from cgwm.pipeline.control.solvers import Solution
 from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, Pose, Provenance
-from hand_cem import run_cem
+from hand_cem import CemController
 from processor_clock import charge_processors
 from store import Store
 
@@ -109,11 +109,11 @@ class Hold:
 
 def measure(name: str, task: HandTask, seed: int, clock: str, device: str) -> dict[str, Any]:
     """Return the figures of one run."""
-    solver = "mppi" if name in ("hold", "cem") else name
-    controller = HandController(cube(), task, solver, device=device)  # pyright: ignore[reportArgumentType]
     if name == "cem":
-        ended, goals, time_s = run_cem(controller, task.folder, seed, task.success.timeout_s)
-        return {"ended": ended, "time_s": round(time_s, 2), "goals": goals}
+        controller = CemController(cube(), task)
+    else:
+        solver = "mppi" if name == "hold" else name
+        controller = HandController(cube(), task, solver, device=device)  # pyright: ignore[reportArgumentType]
     if name == "hold":
         controller._solver = Hold()
     if clock == "cpu":

@@ -1,119 +1,122 @@
 """Cross-entropy method over MuJoCo for a cube in a LEAP hand, with the settings that judo-rai 0.1.0 has for it.
 
 32 samples of 1 s of the scene in which judo plans (`xml/leap_cube.xml`, 10 ms), four nodes of a cubic spline, three
-elites, noise that grows along the plan, and judo's cost; written anew. Compute is for free: a plan acts at once.
+elites, noise that grows along the plan, and judo's cost; written anew. It is a controller like that of cgwm, so that
+one loop drives both: commands of 10 ms, without limits of speed, and a plan as often as the task has commands.
 """
 
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
+import math
+import time
 from typing import Any
 
 import numpy as np
 import torch
+from cgwm.datasets.models.model import Model
 from cgwm.pipeline.control.hand_controller import HandController
-from cgwm.pipeline.control.hand_loop import goals_of, hand_errors, hand_start
 from cgwm.pipeline.control.hand_objective import turn_to
-from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
-from cgwm.pipeline.control.horizon import Array
+from cgwm.pipeline.control.horizon import Array, Forecast, Targets
+from cgwm.pipeline.control.planning import ControlPlan, ControlState
+from cgwm.schemas import HandTask
 from scipy.interpolate import interp1d
 
 mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs
 SAMPLES, ELITES, NODES, HORIZON_S = 32, 3, 4, 1.0
 SIGMA, RAMP = (0.1, 1.0), 4.0
 """Smallest and largest standard deviation [rad], and its growth along the plan."""
+PIECE_S = 0.01
+"""Length of commands, and of the steps of predictions [s]."""
+NODES_S = np.linspace(0, HORIZON_S, NODES)
+STEPS_S = PIECE_S * (1 + np.arange(round(HORIZON_S / PIECE_S)))
 PLACE_WEIGHT, TURN_WEIGHT = 50.0, 0.05
 """Costs of squared errors of position [1/m2] and turn [1/rad2], as means over the plan."""
 
 
-class Cem:
-    """The planner.
+class CemController(HandController):
+    """The planner as a controller.
 
     Args:
-        scene: Folder of the scenes.
-        joints: Names of the joints.
-        home: Their targets before the first plan [rad].
-        wanted_m: Where the cube is wanted [m].
-        seed: Seed of the noise.
+        model: The object.
+        task: The task, whose plant is one of judo's scenes; `control_hz` is the rate of plans.
     """
 
-    def __init__(self, scene: Path, joints: tuple[str, ...], home: Array, wanted_m: Array, seed: int) -> None:
-        self.model = model = mujoco.MjModel.from_xml_path(str(scene / "xml" / "leap_cube.xml"))
-        self.data = mujoco.MjData(model)
-        numbers = [model.joint(name).id for name in joints]
-        self.places, self.speeds = model.jnt_qposadr[numbers], model.jnt_dofadr[numbers]
-        self.servos = [next(k for k in range(model.nu) if model.actuator_trnid[k, 0] == n) for n in numbers]
-        joint = model.body_jntadr[model.body("cube").id]
-        self.place, self.speed = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-        self.lower, self.upper = model.actuator_ctrlrange[self.servos].T
-        self.wanted_m, self.rng = wanted_m, np.random.default_rng([seed, 1])
-        self.nodes_s = np.linspace(0, HORIZON_S, NODES)
-        self.steps_s = (1 + np.arange(round(HORIZON_S / model.opt.timestep))) * model.opt.timestep
-        self.sigma = np.full((NODES, len(joints)), 0.5 * sum(SIGMA))
-        self.spline = _spline(self.nodes_s, np.tile(home, (NODES, 1)))
+    def __init__(self, model: Model, task: HandTask) -> None:
+        super().__init__(model, task)
+        self.every_s, self.interval_s = self.interval_s, PIECE_S
+        self.scene = scene = mujoco.MjModel.from_xml_path(str(task.folder / "xml" / "leap_cube.xml"))
+        self.data = mujoco.MjData(scene)
+        numbers = [scene.joint(name).id for name in self.joints]
+        self.places, self.speeds = scene.jnt_qposadr[numbers], scene.jnt_dofadr[numbers]
+        self.servos = [next(k for k in range(scene.nu) if scene.actuator_trnid[k, 0] == n) for n in numbers]
+        joint = scene.body_jntadr[scene.body("cube").id]
+        self.place, self.speed = scene.jnt_qposadr[joint], scene.jnt_dofadr[joint]
+        self.lower, self.upper = scene.actuator_ctrlrange[self.servos].T
 
-    def plan(self, now_s: float, truth: HandTruth, goal_wxyz: Array) -> None:
-        """Make a plan from a state."""
-        ramp = np.linspace(RAMP / NODES, RAMP, NODES)[:, None]
-        self.sigma = np.clip(self.sigma * ramp, *SIGMA)
-        mean = self.spline(now_s + self.nodes_s)
-        noise = self.rng.normal(size=(SAMPLES - 1, *self.sigma.shape)) * self.sigma
+    def restart(self, seed: int) -> None:
+        """See :class:`HandController`."""
+        super().restart(seed)
+        self.sigma = np.full((NODES, len(self.joints)), 0.5 * sum(SIGMA))
+        self.spline = _spline(NODES_S, np.tile(self.hand.home, (NODES, 1)))
+
+    def limits(self, joint: str) -> tuple[float, float, float]:
+        """See :class:`HandController`; commands have no limit of speed."""
+        return *super().limits(joint)[:2], math.inf
+
+    def plan(self, state: ControlState | None, acts_s: float | None = None) -> ControlPlan | None:
+        """Return a plan from a state; None where the next one is not due, so that the one before goes on."""
+        if state is None or (self._plan and state.time_s < self._plan.state_s + self.every_s - 1e-9):
+            return None
+        wall, cpu = time.perf_counter(), time.process_time()
+        acts = max(state.time_s, acts_s or 0.0)
+        cost = self._search(state, acts)
+        times = acts + PIECE_S * np.arange(len(STEPS_S) + 1)
+        targets = Targets(times_s=times, values_m=np.clip(self.spline(times), self.lower, self.upper))
+        self._plan = ControlPlan(
+            state_s=state.time_s, acts_s=acts, targets=targets, cost=cost,
+            wall_s=time.perf_counter() - wall, cpu_s=time.process_time() - cpu,
+        )  # fmt: skip
+        return self._plan
+
+    def forecast(self) -> Forecast:
+        """Return what the best sample of the last plan does."""
+        return self.best
+
+    def _search(self, state: ControlState, acts_s: float) -> float:
+        """Make a plan, and return the cost of the best sample."""
+        self.sigma = np.clip(self.sigma * np.linspace(RAMP / NODES, RAMP, NODES)[:, None], *SIGMA)
+        mean = self.spline(acts_s + NODES_S)
+        noise = self._rng.normal(size=(SAMPLES - 1, *self.sigma.shape)) * self.sigma
         nodes = np.clip(np.concatenate((mean[None], mean + noise)), self.lower, self.upper)
-        elites = nodes[self._costs(truth, nodes, goal_wxyz).argsort()[:ELITES]]
-        self.sigma = np.clip(elites.std(0), *SIGMA)
-        self.spline = _spline(now_s + self.nodes_s, elites.mean(0))
+        pose = self._predicted(state, nodes)
+        turn = turn_to(torch.as_tensor(pose[..., 3:].copy()), torch.as_tensor(self.goal_wxyz)).numpy()
+        place = pose[..., :3] - np.array(self.task.wanted_m)
+        costs = PLACE_WEIGHT * (place**2).sum(-1).mean(-1) + TURN_WEIGHT * (turn**2).sum(-1).mean(-1)
+        elites = costs.argsort()[:ELITES]
+        self.sigma = np.clip(nodes[elites].std(0), *SIGMA)
+        self.spline = _spline(acts_s + NODES_S, nodes[elites].mean(0))
+        best = pose[elites[0]]
+        self.best = Forecast(times_s=acts_s + STEPS_S, position_m=best[:, :3], quat_wxyz=best[:, 3:])
+        return float(costs[elites[0]])
 
-    def target(self, time_s: float) -> Array:
-        """Return the targets of the joints at a time [rad]."""
-        return np.clip(self.spline(time_s), self.lower, self.upper)
-
-    def _costs(self, truth: HandTruth, nodes: Array, goal_wxyz: Array) -> Array:
-        model, data = self.model, self.data
-        commands = np.zeros((len(nodes), len(self.steps_s), model.nu))
-        commands[:, :, self.servos] = np.stack([_spline(self.nodes_s, one)(self.steps_s) for one in nodes])
-        data.qpos[:], data.qvel[:] = model.qpos0, 0
-        data.qpos[self.places], data.qvel[self.speeds] = truth.joints_rad, truth.speeds_rad_s
-        data.qpos[self.place : self.place + 7] = [*truth.position_m, *truth.quat_wxyz]
-        data.qvel[self.speed : self.speed + 6] = [*truth.velocity_m_s, *truth.omega_body_rad_s]
+    def _predicted(self, state: ControlState, nodes: Array) -> Array:
+        """Return the poses (samples, steps, 7) of the cube."""
+        scene, data = self.scene, self.data
+        commands = np.zeros((len(nodes), len(STEPS_S), scene.nu))
+        commands[:, :, self.servos] = np.stack([_spline(NODES_S, one)(STEPS_S) for one in nodes])
+        data.qpos[:], data.qvel[:] = scene.qpos0, 0
+        data.qpos[self.places] = [state.joints[name] for name in self.joints]
+        data.qvel[self.speeds] = [(state.joint_speeds or {})[name] for name in self.joints]
+        data.qpos[self.place : self.place + 7] = np.concatenate((state.position_m, state.quat_wxyz))
+        moving = (state.velocity_m_s, state.omega_body_rad_s)
+        data.qvel[self.speed : self.speed + 6] = np.concatenate([x for x in moving if x is not None])
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        start = np.zeros(mujoco.mj_stateSize(model, kind))
-        mujoco.mj_getState(model, data, start, kind)
+        start = np.zeros(mujoco.mj_stateSize(scene, kind))
+        mujoco.mj_getState(scene, data, start, kind)
         rollout = importlib.import_module("mujoco.rollout")
-        states, _ = rollout.rollout(model, [data], np.repeat(start[None], len(nodes), 0), commands)
-        pose = states[:, :, 1 + self.place : 8 + self.place]  # behind the time
-        turn = turn_to(torch.as_tensor(pose[..., 3:].copy()), torch.as_tensor(goal_wxyz)).numpy()
-        place = pose[..., :3] - self.wanted_m
-        return PLACE_WEIGHT * (place**2).sum(-1).mean(-1) + TURN_WEIGHT * (turn**2).sum(-1).mean(-1)
-
-
-def run_cem(controller: HandController, scene: Path, seed: int, most_s: float) -> tuple[str, int, float]:
-    """Run the task of a controller by the planner; return why it ended, the goals reached and its time [s].
-
-    Args:
-        controller: Has the task and its rate.
-        scene: Folder of the scenes.
-        seed: Seed of the run.
-        most_s: Time after which it ends [s].
-    """
-    task, plant, interval = controller.task, HandScenePlant(controller.hand), controller.interval_s
-    truth, goals = plant.reset(*hand_start(task, seed)), goals_of(task, seed)
-    planner = Cem(scene, controller.joints, controller.hand.home, np.array(task.wanted_m), seed)
-    goal, count, since = next(goals), 0, 0.0
-    for number in range(round(most_s / interval)):
-        planner.plan(number * interval, truth, goal)
-        pieces = round(interval / 0.01)
-        for piece in range(1, pieces + 1):
-            truth = plant.advance(planner.target((number + piece / pieces) * interval), interval / pieces)
-        away, turn = hand_errors(task, truth, goal)
-        since += interval
-        if turn <= task.success.turn_deg:
-            count, goal, since = count + 1, next(goals), 0.0
-        if count >= task.success.goals or away > task.success.drop_m:
-            return "success" if count >= task.success.goals else "dropped", count, (number + 1) * interval
-        if since >= task.success.goal_s:
-            break
-    return "timeout", count, (number + 1) * interval
+        states, _ = rollout.rollout(scene, [data], np.repeat(start[None], len(nodes), 0), commands)
+        return states[:, :, 1 + self.place : 8 + self.place]  # behind the time
 
 
 def _spline(times_s: Array, values: Array) -> Any:
