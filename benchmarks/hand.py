@@ -21,6 +21,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -79,10 +80,25 @@ def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
         '<include file="leap_components/params_hand.xml"/><worldbody><body name="leap_hand">'
         '<include file="leap_components/leap_hand.xml"/></body></worldbody></mujoco>'
     )
+    fingers = [[f"{finger}_{part}" for part in ("bs", "px", "md", "ds")] for finger in ("if", "mf", "rf")]
+    fingers.append(["th_mp", "th_bs", "th_px", "th_ds"])
+    touching = [
+        pair
+        for first, second in combinations(fingers, 2)
+        for pair in product(first, second)
+        if pair != (first[0], second[0])
+    ]
+    touching += [(finger[-1], "leap_hand") for finger in fingers]  # what the scene does not exclude, fingers apart
     tips = {f"{finger}_ds/3": TIP_FRICTION for finger in ("if", "mf", "rf", "th")}  # the last part of each
     task = HandTask.model_validate(
         {
-            "robot": {"file": "xml/hand.xml", "quat_wxyz": ROOT_WXYZ, "friction": tips, "corners": given.corners},
+            "robot": {
+                "file": "xml/hand.xml",
+                "quat_wxyz": ROOT_WXYZ,
+                "friction": tips,
+                "corners": given.corners,
+                "touching": touching if given.touching else (),
+            },
             "start": {"position_m": PLACE_M, "joints": HOME},
             "goal": {"turn_deg": 23.0},
             "planner": {
@@ -169,6 +185,9 @@ def main() -> None:
     parser.add_argument("--hz", type=float, default=50.0)
     parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--corners", type=int, default=24, help="of the shape of a part of a link")
+    parser.add_argument(
+        "--touching", action=argparse.BooleanOptionalAction, default=True, help="fingers touch each other"
+    )
     parser.add_argument("--horizon", type=float, default=0.5)
     parser.add_argument("--step", type=float, default=0.01)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the predictions")

@@ -66,7 +66,7 @@ class Moment:
 def task_of(folder: str, scene: Path, corners: int, step_s: float, seconds: float = 60.0) -> HandTask:
     """Return the task of `hand.py` with plans of 64 samples over 0.5 s."""
     given = argparse.Namespace(
-        corners=corners, hz=1 / INTERVAL_S, samples=64, horizon=0.5, step=step_s, seconds=seconds
+        corners=corners, hz=1 / INTERVAL_S, samples=64, horizon=0.5, step=step_s, seconds=seconds, touching=True
     )
     return hand.task_in(Path(folder), scene, given)
 

@@ -47,6 +47,10 @@ class HandSection(TaskSection):
     """Links that the object never touches; predictions without their shapes are faster."""
     corners: Annotated[int, Field(ge=4, le=200)] = 24
     """Largest number of corners of the convex shape of each part of a link."""
+    touching: tuple[tuple[str, str], ...] = ()
+    """Pairs of links of different fingers, or of a finger and the root, that touch each other; others pass through each
+    other. A link touches others as the hull of its parts, the root as its parts.
+    """
 
 
 class HandServoSection(TaskSection):
@@ -258,6 +262,7 @@ def require_joints(task: HandTask, known: tuple[str, ...], links: tuple[str, ...
         ("[start] joints", task.start.joints, "joint", known),
         ("[robot] friction", task.robot.friction, "link", (*links, *parts)),
         ("[robot] apart", task.robot.apart, "link", links),
+        ("[robot] touching", tuple(name for pair in task.robot.touching for name in pair), "link", links),
     )
     for place, names, kind, legal in given:
         for name in names:

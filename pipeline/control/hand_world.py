@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -16,17 +17,19 @@ from ...schemas import HandTask, InputDataError, require_joints
 from ...schemas.materials import pair_of
 from ..physics.articulated import Servo, chain_of
 from ..physics.chain import Chain, Joint
-from ..physics.chain_state import with_joints
+from ..physics.chain_state import require_touching, with_joints
 from ..physics.checks import require_apart
 from ..physics.contact_law import ContactLaw
 from ..physics.hull import Hull
 from ..physics.world import Body, State, World
-from ..sg_gs.link_hulls import Balls, link_hulls
+from ..sg_gs.link_hulls import Balls, link_hulls, whole_hull
 from .horizon import Array
 from .task_world import free_object, require_metric, require_rigid, softened
 
 OBJECT, LINK = "the object", "a link"
 """Materials of the object, and prefix of those of links with a friction of their own."""
+WHOLE_CORNERS = 12
+"""Largest number of corners of the hulls by which links touch each other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +130,7 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
     shapes = {
         name: balls for name, balls in link_hulls(hand, task.robot.corners).items() if name not in task.robot.apart
     }
-    chain, bodies = _shaped(task, chain, links, shapes)
+    chain, bodies = _touching(task, hand, *_shaped(task, chain, links, shapes))
     world = world_of(model, task, chain, bodies)
     limits = [_limits(task, joint) for joint in chain.moving]
     lower, upper = (np.array(side) for side in zip(*limits, strict=True))
@@ -150,7 +153,13 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
 
 def _parts(hand: Articulation) -> tuple[str, ...]:
     """Return the names of the further parts of links."""
-    return tuple(_part(link.name, k) for link in hand.links for k in range(1, len(link.geometry)))
+    return tuple(part for link in hand.links for part in _parts_of(hand, link.name))
+
+
+def _parts_of(hand: Articulation, name: str) -> tuple[str, ...]:
+    """Return the names of the further parts of a link."""
+    link = next(link for link in hand.links if link.name == name)
+    return tuple(_part(name, k) for k in range(1, len(link.geometry)))
 
 
 def _part(link: str, number: int) -> str:
@@ -212,6 +221,30 @@ def _shaped(
             joints.append(Joint.of(f"{name}/fixed", "fixed", name, link.name))
     every = [replace(body, material=_material(task, body.name)) for body in (*bodies, *more)]
     return replace(chain, joints=(*chain.joints, *joints)), every
+
+
+def _touching(task: HandTask, hand: Articulation, chain: Chain, bodies: list[Body]) -> tuple[Chain, list[Body]]:
+    """Return the chain and its links with those by which links touch each other: their hulls, and parts of the root."""
+    root = hand.links[0].name
+    if root in task.robot.apart and any(root in pair for pair in task.robot.touching):
+        raise InputDataError(
+            f"{task.source}: [robot] touching: '{root}' is apart, and so has no shape.",
+            todo="take it out of one of both.",
+        )
+    require_touching(f"{task.source}: [robot] touching", replace(chain, touching=task.robot.touching))
+    names = dict.fromkeys(name for pair in task.robot.touching for name in pair if name != root)
+    links = {link.name: link for link in hand.links}
+    more = []
+    for name in names:
+        body = next(body for body in bodies if body.name == name)
+        made = replace(body, name=f"{name}/whole", mass=0 * body.mass, inertia=0 * body.inertia)
+        more.append(_with_hull(made, whole_hull(links[name], WHOLE_CORNERS)))
+    shapes = {name: (f"{name}/whole",) for name in names} | {root: (root, *_parts_of(hand, root))}
+    pairs = tuple(pair for first, second in task.robot.touching for pair in product(shapes[first], shapes[second]))
+    joints = tuple(Joint.of(f"{body.name}/fixed", "fixed", body.name, body.name.rpartition("/")[0]) for body in more)
+    within = tuple(body.name for body in more)
+    chain = replace(chain, joints=(*chain.joints, *joints), touching=pairs, within=within)
+    return chain, [*bodies, *more]
 
 
 def _material(task: HandTask, part: str) -> str | None:

@@ -160,6 +160,10 @@ class Chain:
     """How the root moves: "free", "driven" or "fixed"."""
     joints: tuple[Joint, ...]
     """The joints, parents before children."""
+    touching: tuple[tuple[str, str], ...] = ()
+    """Pairs of links that touch each other; no joint may move both. Other links of a chain pass through each other."""
+    within: tuple[str, ...] = ()
+    """Links that touch nothing but links of the chain."""
 
     @cached_property
     def links(self) -> tuple[str, ...]:
@@ -196,6 +200,19 @@ class Chain:
                 row[column] = True
             rows.append(tuple(row))
         return tuple(rows)
+
+    @cached_property
+    def branches(self) -> tuple[int, ...]:
+        """Place in `links` of the first link that moves, from the root to each link; the root where none does.
+
+        Impulses on links of different branches do not act on each other where the root is not free.
+        """
+        if self.base == "free":
+            return (0,) * len(self.links)
+        found = [0]
+        for link, (parent, row) in enumerate(zip(self.parents[1:], self.above[1:], strict=True), 1):
+            found.append(found[parent] if any(self.above[parent]) else link if any(row) else 0)
+        return tuple(found)
 
     @cached_property
     def frames(self) -> JointFrames:

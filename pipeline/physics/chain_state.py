@@ -63,9 +63,34 @@ def _require_tree(world: World, chain: Chain, bodies: Mapping[str, Body], owner:
             )
         owner[link] = chain.name
         seen.append(link)
+    require_touching(place, chain)
     if not chain.joints or (chain.base != "free" and not chain.moving):
         raise InputDataError(f"{place}: none of its joints moves.", todo="take a driven or fixed body instead.")
     _require_inertia(place, chain, bodies)
+
+
+def require_touching(place: str, chain: Chain) -> None:
+    """Check that links that touch each other are links of the chain, of which no joint moves both.
+
+    Args:
+        place: What the message begins with.
+        chain: The chain.
+
+    Raises:
+        InputDataError: If they are not, with their names.
+    """
+    known = chain.links
+    for name in (*(name for pair in chain.touching for name in pair), *chain.within):
+        if name not in known:
+            raise InputDataError(f"{place}: there is no link '{name}'.", ", ".join(known) + ".")
+    for first, second in chain.touching:
+        rows = [chain.above[known.index(name)] for name in (first, second)]
+        if chain.base == "free" or any(map(all, zip(*rows, strict=True))) or not any(map(any, rows)):
+            raise InputDataError(
+                f"{place}: '{first}' and '{second}' cannot touch each other: a joint or a free root moves both, or "
+                "none moves either.",
+                "links on different branches of a root that is not free.",
+            )
 
 
 def _require_inertia(place: str, chain: Chain, bodies: Mapping[str, Body]) -> None:

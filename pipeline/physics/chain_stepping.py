@@ -92,7 +92,8 @@ class ChainStepper:
         each = self.kicked.rows[:, link] @ self.kicked.inverse_root.transpose(-1, -2)
         linear = sign * axes.flatten(1, 2) @ each[:, :3]
         turning = sign * cross(arms[:, :, None], axes).flatten(1, 2) @ each[:, 3:]
-        return Rows(self.root, sign, linear + turning, each[:, 3:], linked=True)
+        branch = self.dynamics.indices[self.chain.branches[link]]
+        return Rows(self.root, sign, linear + turning, each[:, 3:], linked=True, branch=branch)
 
     def after(self, wrenches: Mapping[int, tuple[Tensor, Tensor]], step_s: Tensor) -> list[Motion]:
         """Move the chain to the end of the step, and return the motions of the links there.

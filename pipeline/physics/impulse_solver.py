@@ -49,6 +49,15 @@ class Rows:
     """
     linked: bool = False
     """Whether the body is a link of a chain, and `body` the root of the chain."""
+    branch: int | None = None
+    """Index of the body that stands for all on which its impulses act at once: of a link the first of its branch that
+    moves; None for `body`.
+    """
+
+    @property
+    def shared(self) -> int:
+        """Index of the body among whose contacts the mass is divided."""
+        return self.body if self.branch is None else self.branch
 
     @staticmethod
     def of(
@@ -273,17 +282,17 @@ def solve_with_joints(
 
 
 def _splitting(groups: Sequence[ContactGroup]) -> Sequence[ContactGroup]:
-    """Divide the mass of each body among the groups that touch it, so that the iterations do not overshoot."""
+    """Divide the mass of a body, or a branch of a chain, among what touches it, so that iterations do not overshoot."""
     if len(groups) < 2:
         return groups
     count: dict[int, Tensor] = {}
     for group in groups:
         active = (group.target > -0.5 * FAR_M_S).any(1, keepdim=True).to(group.target.dtype)
         for side in group.sides:
-            count[side.body] = active if side.body not in count else count[side.body] + active
+            count[side.shared] = active if side.shared not in count else count[side.shared] + active
     split = []
     for group in groups:
-        share = 1 / torch.stack([count[side.body] for side in group.sides]).amax(0).clamp_min(1.0)
+        share = 1 / torch.stack([count[side.shared] for side in group.sides]).amax(0).clamp_min(1.0)
         turning = group.turning
         if turning is not None:
             turning = replace(turning, stop=share[..., None] * turning.stop)

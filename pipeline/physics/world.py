@@ -224,21 +224,31 @@ class World:
     def pairs(self) -> list[tuple[int, int]]:
         """The pairs that can touch: each free body with the ground (-1), fixed surfaces (-2, ...) and other bodies.
 
-        Links of chains are as free bodies; but links of one chain do not touch each other, and a link that no joint
-        moves only touches what moves.
+        Links of chains are as free bodies; but of one chain only those touch each other that it lists, and a link that
+        no joint moves only touches what moves.
         """
         if not self.touching:
             return []
         solid = [k for k, body in enumerate(self.bodies) if body.radii.shape[-1] > 0]
         moving = [k for k in solid if self.moves(k)]
-        on_ground = [] if self.ground_normal is None else [(i, -1) for i in moving]
-        on_surfaces = [(i, -2 - s) for i in moving for s in range(len(self.surfaces))]
+        within = {name for chain in self.chains for name in chain.within}
+        outer = [k for k in moving if self.bodies[k].name not in within]
+        on_ground = [] if self.ground_normal is None else [(i, -1) for i in outer]
+        on_surfaces = [(i, -2 - s) for i in outer for s in range(len(self.surfaces))]
         return on_ground + on_surfaces + self._between(solid, moving)
 
     def _between(self, solid: Sequence[int], moving: Sequence[int]) -> list[tuple[int, int]]:
         """Return the pairs of solid bodies that can touch each other, of which one at least moves: that one first."""
         chain = {k: self.chain_of(k) if self.chains else -1 for k in solid}
-        apart = [(i, j) for i, j in combinations(solid, 2) if chain[i] < 0 or chain[i] != chain[j]]
+        within = {name for one in self.chains for name in one.within}
+        inner = {k for k in solid if self.bodies[k].name in within}
+        own = {frozenset(pair) for one in self.chains for pair in one.touching}
+        names = self.body_names
+        apart = [
+            (i, j)
+            for i, j in combinations(solid, 2)
+            if (frozenset((names[i], names[j])) in own if 0 <= chain[i] == chain[j] else not inner & {i, j})
+        ]
         ordered = [(i, j) if i in moving else (j, i) for i, j in apart]
         return [pair for pair in ordered if pair[0] in moving]
 

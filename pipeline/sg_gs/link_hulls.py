@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from ...datasets.robots import Articulation
+from ...datasets.robots import Articulation, LinkOfRobot
 from ..geometry.directions import fibonacci_directions
 from .link_spheres import mesh_of_part
 
@@ -38,6 +38,11 @@ def link_hulls(articulation: Articulation, corners: int) -> dict[str, list[Balls
         link.name: [rounded_hull(mesh_of_part(part).vertices, corners) for part in link.geometry]
         for link in articulation.links
     }
+
+
+def whole_hull(link: LinkOfRobot, corners: int) -> Balls:
+    """Return centres (n, 3) and radii (n,) [m] of the balls whose hull is that of all parts of a link, in its frame."""
+    return rounded_hull(np.concatenate([mesh_of_part(part).vertices for part in link.geometry]), corners)
 
 
 def rounded_hull(points: Array, corners: int) -> Balls:

@@ -82,11 +82,14 @@ class Tree:
         return list(found.values())
 
     def groups(self, free: Sequence[bool]) -> list[int]:
-        """Return for each body the one under which its contacts count: a chain's root; -1 where it cannot move."""
+        """Return for each body the one under which its contacts count, -1 where it cannot move.
+
+        A link counts under the first link that moves on the way from the root to it.
+        """
         found = [index if moves else -1 for index, moves in enumerate(free)]
         for link, body in enumerate(self.bodies):
             if self.above[link]:
-                found[body] = self.bodies[self._root(link)]
+                found[body] = self.bodies[self.dof_links[self.above[link][0]]]
         return found
 
     def _root(self, link: int) -> int:

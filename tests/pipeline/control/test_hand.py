@@ -116,6 +116,22 @@ def test_each_part_of_a_link_is_a_shape_that_may_have_a_friction_of_its_own(fold
         hand_world(model, hand_task(folder, robot=robot | {"friction": {"arm/2": 0.9}}))
 
 
+def test_a_link_touches_the_root_as_the_hull_of_its_parts_and_the_object_as_its_parts(
+    folder: Path, model: Model
+) -> None:
+    one = '<geom type="box" size="0.04 0.006 0.015" pos="0.04 0 0" mass="0.05"/>'
+    hook = one + '<geom type="box" size="0.006 0.03 0.015" pos="0.08 0.03 0" mass="0.01"/>'
+    (folder / "parts.xml").write_text((folder / "hand.xml").read_text().replace(one, hook))
+    world = hand_world(model, hand_task(folder, robot={"file": "parts.xml", "touching": (("arm", "palm"),)})).world
+    names = world.body_names
+    assert names == ["palm", "arm", "tip", "arm/1", "arm/whole", "cube"]
+    pairs = {(names[a], names[b]) for a, b in world.pairs}
+    assert pairs == {("cube", "palm"), *((name, "cube") for name in ("arm", "tip", "arm/1")), ("arm/whole", "palm")}
+    low, high = (getattr(world.bodies[4].centers[0], side)(0).values for side in ("min", "max"))
+    assert 0.06 < (high - low)[1] < 0.067  # of both parts
+    assert float(world.bodies[4].mass) == 0.0
+
+
 def test_an_object_beyond_what_is_kept_costs_its_further_distance(folder: Path, model: Model) -> None:
     costs = []
     for lost_m in (1e5, 0.01):
@@ -240,6 +256,9 @@ def test_printed_tasks_are_read_again(tmp_path: Path) -> None:
         ({"start": {"joints": {"swing": 2.0}}}, "'swing' = 2 rad"),
         ({"robot": {"friction": {"thumb": 0.3}}}, "the hand has no link 'thumb'"),
         ({"robot": {"apart": ("tap",)}}, "the hand has no link 'tap'; .* Did you mean 'tip'?"),
+        ({"robot": {"touching": (("tip", "plam"),)}}, "the hand has no link 'plam'; .* Did you mean 'palm'?"),
+        ({"robot": {"touching": (("tip", "arm"),)}}, r"\[robot\] touching: .*'tip' and 'arm' cannot touch each other"),
+        ({"robot": {"apart": ("palm",), "touching": (("tip", "palm"),)}}, "'palm' .*has no shape"),
         ({"start": {"position_m": (-0.03, 0.0, 0.035)}}, "the start: .*inside"),
         ({"goal": {"position_m": (-0.03, 0.0, 0.035)}}, "position_m: .*inside"),
         ({"robot": {"file": "nothing.xml"}}, r"task\.toml: \[robot\] file: .*nothing\.xml"),

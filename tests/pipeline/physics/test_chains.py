@@ -270,6 +270,42 @@ def test_two_yielding_fingers_squeeze_a_ball_with_gain_times_deflection() -> Non
     assert float(last.velocity_m_s[0, 3].norm()) < 1e-3
 
 
+def test_two_fingers_press_each_other_with_gain_times_deflection() -> None:
+    """The guard of one finger touches the other finger, and no ball that lies within it."""
+    bodies = [link("palm", 0.0), *(link(name, 0.02, com=(0.05, 0, 0)) for name in ("left", "right"))]
+    spheres = ((0.1, 0.0, 0.0, 0.02),)
+    bodies += [link("tip", 0.0, spheres=spheres), link("guard", 0.0, spheres=spheres)]
+    joints = [
+        Joint.of(
+            f"{name}_joint", "hinge", name, "palm", position_m=(0, y, 0), stiffness=2.0, damping=0.05, armature=1e-3
+        )
+        for name, y in (("left", 0.025), ("right", -0.025))
+    ]
+    joints += [Joint.of("t", "fixed", "tip", "left"), Joint.of("g", "fixed", "guard", "right")]
+    chain = Chain(
+        name="hand", root="palm", base="fixed", joints=tuple(joints), touching=(("tip", "guard"),), within=("guard",)
+    )
+    ball = replace(ball_body(0.01, 0.05), name="ball")
+    world = chained(chain, *bodies, ball, ground=False, gravity=0.0, step_s=0.002)
+    state = still(6)
+    state.position_m[:, 5] = torch.tensor([0.1, -0.04, 0.0])
+    state = with_joints(world, state, {})
+    target = {"hand": JointCommand.hold_still(batch([-0.3, 0.2]))}
+    found = rollout(world, state, times(0.6, 20.0), target, record_contacts=True)
+    values = joints_of(world, State(*(getattr(found, k)[:, -1] for k in POSES)), chain)[0][0]
+    record = found.contacts
+    assert record is not None
+    force = record.impulse_n_s[0, -1].sum(0) / 0.05
+    angle = [float(value) for value in values]
+    tip = [np.array([0.1 * math.cos(a), y + 0.1 * math.sin(a)]) for a, y in zip(angle, (0.025, -0.025), strict=True)]
+    x, y = (tip[0] + tip[1]) / 2
+    for value, wanted, root in zip(angle, (-0.3, 0.2), (0.025, -0.025), strict=True):
+        moment = abs(x * float(force[1]) - (y - root) * float(force[0]))
+        assert moment > 0.05
+        assert moment == pytest.approx(2.0 * abs(wanted - value), rel=0.01)
+    assert float(found.velocity_m_s[0, -1, 5].norm()) == 0.0
+
+
 def test_a_driven_root_carries_its_links_and_their_inertia_acts_on_the_joints() -> None:
     from cgwm.pipeline.physics.kinematic import Drive
 
@@ -357,6 +393,10 @@ def test_what_cannot_be_a_chain_is_refused() -> None:
     apart.position_m[0, 2, 1] += 0.01
     with pytest.raises(InputDataError, match="link 'lower' is 10 mm and 0 rad off its joint 'second'"):
         simulate(world, apart, times(0.01))
+    with pytest.raises(InputDataError, match="there is no link 'hand'"):
+        require_chains(replace(world, chains=(replace(chain, within=("hand",)),)))
+    with pytest.raises(InputDataError, match="'upper' and 'lower' cannot touch each other: a joint"):
+        require_chains(replace(world, chains=(replace(chain, touching=(("upper", "lower"),)),)))
     servoed = replace(chain, joints=(replace(chain.joints[0], stiffness=batch(1.0)), chain.joints[1]))
     with pytest.raises(InputDataError, match="have servos and no command"):
         simulate(replace(world, chains=(servoed,)), with_joints(world, still(3), {}), times(0.01))

@@ -54,13 +54,14 @@ def hand(base: str) -> Case:
     """Return two fingers of two joints on a palm that squeeze a ball of many spheres, on the ground or carried.
 
     One joint has dry friction and one a limit that it reaches; one finger ends in a slide, and a tip and a further part
-    without mass are welded on.
+    without mass are welded on. On a driven palm, a guard on one finger touches the tip of the other one.
     """
     spheres = ((0.05, 0.0, 0.0, 0.012), (0.08, 0.0, 0.0, 0.012))
     names = ("left", "left_tip", "right", "right_tip", "nail", "part")
     bodies: list[Body] = [link("palm", 0.4 if base == "free" else 0.0, spheres=((0.0, 0.0, -0.02, 0.02),))]
     bodies += [link(name, 0.02, com=(0.04, 0, 0), spheres=spheres) for name in names[:4]]
     bodies += [link("nail", 0.02, com=(0.04, 0, 0), spheres=spheres[:1]), link("part", 0.0, spheres=spheres[1:])]
+    guard = [link("guard", 0.0, spheres=((0.05, 0.058, 0.03, 0.03),))] if base == "driven" else []
     same: dict[str, Any] = {"damping": 0.02, "armature": 1e-3, "torque_limit": 0.4}
     joints = (
         Joint.of("l1", "hinge", "left", "palm", position_m=(0, 0.05, 0), stiffness=2.0, friction=0.01, **same),
@@ -70,15 +71,19 @@ def hand(base: str) -> Case:
         Joint.of("r3", "fixed", "nail", "right_tip", position_m=(0.02, 0.0, 0.0), quat_wxyz=(0.9, 0.1, 0.2, 0.3)),
         Joint.of("r4", "fixed", "part", "right_tip", position_m=(-0.07, 0.005, 0.0)),
     )
-    chain = Chain(name="hand", root="palm", base=base, joints=joints)
+    welded = tuple(Joint.of("r5", "fixed", body.name, "right_tip") for body in guard)
+    chain = Chain(
+        name="hand", root="palm", base=base, joints=(*joints, *welded),
+        touching=tuple(("left_tip", body.name) for body in guard), within=tuple(body.name for body in guard),
+    )  # fmt: skip
     turns = torch.linspace(0, 5.5, 8, dtype=F64)
     centers = 0.02 * torch.stack((turns.cos(), turns.sin(), 0.2 * turns.sin()), -1)
     ball = replace(ball_body(0.012, 0.1), centers=centers[None], radii=torch.full((1, 8), 0.012, dtype=F64))
-    world = chained(chain, *bodies, ball, step_s=0.004)
+    world = chained(chain, *bodies, *guard, ball, step_s=0.004)
     world = replace(world, ground_offset=batch(-0.04))
-    state = still(8)
-    state.position_m[:, 7] = torch.tensor([0.1, 0.0, -0.002])
-    state.velocity_m_s[:, 7, 1] = 0.1
+    state = still(len(world.bodies))
+    state.position_m[:, -1] = torch.tensor([0.1, 0.0, -0.002])
+    state.velocity_m_s[:, -1, 1] = 0.1
     state = with_joints(world, state, {"l1": -0.05, "r2": 0.1}, {"r1": 0.3})
     values = torch.tensor([[0.0, 0.0, 0.0, 0.0], [-0.4, 0.01, 0.4, 0.3], [-0.5, -0.01, 0.3, 0.2]], dtype=F64)
     commands: dict[str, Any] = {"hand": JointCommand.targets(batch([0.0, 0.06, 0.1]), values[None], "cubic")}
@@ -99,6 +104,10 @@ def test_poses_and_contacts_are_those_of_the_torch_engine(fused: Fused, base: st
     assert expected.contacts is not None and found.contacts is not None
     acted = expected.contacts.impulse_n_s.norm(dim=-1).sum((0, 1)) > 0
     assert len(set(expected.contacts.body_a[acted].tolist())) >= 3  # fingers, ball and ground are in contact
+    names = world.body_names
+    pairs = {(names[a], names[max(b, 0)]) for a, b in zip(
+        expected.contacts.body_a[acted].tolist(), expected.contacts.body_b[acted].tolist(), strict=True)}  # fmt: skip
+    assert (("left_tip", "guard") in pairs) == (base == "driven")
     for name in POSES:
         np.testing.assert_allclose(getattr(found, name).cpu(), getattr(expected, name), atol=1e-9, err_msg=name)
     np.testing.assert_allclose(found.contacts.impulse_n_s.cpu(), expected.contacts.impulse_n_s, atol=1e-9)
