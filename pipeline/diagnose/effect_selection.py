@@ -328,9 +328,15 @@ def _told(one: Evidence) -> float:
     return _bic(one) - one.odds
 
 
-def _complexity(one: Evidence) -> tuple[bool, int, float, str]:
-    """Return what equals are ordered by: whether they act through another effect, their parameters, and BIC."""
-    return "drag" in one.candidate.effect.needs, len(one.candidate.effect.parameters), _bic(one), one.name
+def _complexity(one: Evidence) -> tuple[bool, int, float, float, bool, str]:
+    """Return what equals are ordered by: whether they act through another effect, their parameters, odds, and BIC.
+
+    The odds of their sizes come before BIC, whose differences the data do not prove; to rounding, forces come first.
+    """
+    effect = one.candidate.effect
+    found = _bic(one)
+    near = round(found) if math.isfinite(found) else found
+    return "drag" in effect.needs, len(effect.parameters), one.odds, near, effect.phase == "measurement", one.name
 
 
 def _contains(

@@ -22,8 +22,12 @@ def implausible(effect: Effect, values: Mapping[str, float]) -> list[EffectParam
 
 
 def prior_odds(effect: Effect, values: Mapping[str, float]) -> float:
-    """Return what chi2 has to fall by for an effect of such values, in addition to that of a plausible one."""
-    return THRESHOLDS.flight.implausible * len(implausible(effect, values))
+    """Return what chi2 has to fall by for an effect of such values, in addition to that of a plausible one.
+
+    A size that no mistake has, such as a lift by a third of the weight, counts twice.
+    """
+    impossible = [p for p in effect.parameters if abs(values.get(p.name, 0.0)) > p.possible]
+    return THRESHOLDS.flight.implausible * (len(implausible(effect, values)) + len(impossible))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,7 +48,7 @@ class FlightThresholds:
         2 * math.log(100),
         "chi2",
         "an effect is worse by this for each value that is larger than instruments or nature have it (`plausible` of "
-        "its parameter): odds of 100 against a mistake of that size",
+        "its parameter), and by as much again where no mistake is that large (`possible`): odds of 100 each",
         "by argument; a clock that runs fast by 7.5 % explained 7 measured drops better than drag by 9 in BIC",
     )
     contained: float = threshold(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from ...schemas import ResidualLaw
+from ..physics.effects.effect import EffectParameter
 from ..report.page import listed
 from ..segments.prepare import Prepared
-from .evidence import implausible
+from .evidence import Evidence, implausible
 from .law_export import further_terms
 from .own_accelerations import UPWARD
 from .verdict import Findings
@@ -155,15 +156,30 @@ def noisy_warnings(prepared: Prepared, findings: Findings) -> list[str]:
 def size_warnings(findings: Findings) -> list[str]:
     """Return a warning for each selected effect that is larger than instruments or nature usually have it."""
     found = []
-    for one in (chosen.evidence for chosen in findings.chosen):
+    for chosen in findings.chosen:
+        one = chosen.evidence
         effect, values = one.candidate.effect, {name: value for name, (value, _) in one.estimates.items()}
+        others = [f"{other.candidate.spec} with {_sizes(other)}" for other in chosen.equals[1:] if other.estimates]
+        same = f" The same is done by {listed(others)}." if others else ""
         for p in implausible(effect, values):
-            unit = "" if p.unit == "1" else f" {p.unit}"
+            unit = _unit(p)
             found.append(
                 f"{one.candidate.spec}: {p.name} = {values[p.name]:.2g}{unit}, and more than {p.plausible:g}{unit} is "
                 "rare. Check what was given (frame rate, units, lengths), or look for a force that does the same."
+                f"{same}"
             )
     return found
+
+
+def _sizes(evidence: Evidence) -> str:
+    """Return the estimates of an effect in words."""
+    parameters = {p.name: p for p in evidence.candidate.effect.parameters}
+    return ", ".join(f"{k} = {v:.2g}{_unit(parameters[k])}" for k, (v, _) in evidence.estimates.items())
+
+
+def _unit(parameter: EffectParameter) -> str:
+    """Return the unit of a parameter as it follows a number; empty for none."""
+    return "" if parameter.unit == "1" else f" {parameter.unit}"
 
 
 def law_warnings(findings: Findings) -> list[str]:

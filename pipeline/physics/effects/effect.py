@@ -48,6 +48,8 @@ class EffectParameter:
     plausible: float = math.inf
     """Largest magnitude that instruments or nature usually have, in its unit; infinite where any size occurs. A larger
     one may be a mistake, such as a wrong frame rate, and has to explain the data better than a force by its odds."""
+    possible: float = math.inf
+    """Largest magnitude that mistakes or nature reach at all, in its unit; infinite where a mistake has any size."""
 
 
 @dataclass(frozen=True)

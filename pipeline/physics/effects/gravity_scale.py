@@ -14,8 +14,8 @@ class GravityScale(Effect):
     name = "gravity_scale"
     summary = "Gravity of another strength."
     formula = "g becomes (1 + s) g"
-    # on the ground gravity is 9.76 to 9.83 m/s2: at most 0.5 % from 9.81
-    parameters = (EffectParameter(name="s", unit="1", scale=0.02, limit=0.9, plausible=0.005),)
+    # on the ground gravity is 9.76 to 9.83 m/s2: at most 0.5 % from 9.81; 10 m/s2 for 9.81 m/s2 is 2 %
+    parameters = (EffectParameter(name="s", unit="1", scale=0.02, limit=0.9, plausible=0.005, possible=0.03),)
     phase = "flight"
     reveals = "drops from great heights, with a checked length and clock"
     source = "definition"

@@ -22,6 +22,9 @@ ODDS = THRESHOLDS.flight.implausible
         ("clock_scale", {"s": 0.001}, 0.0),
         ("length_scale", {"s": 0.019}, 0.0),
         ("gravity_scale", {"s": 0.02}, ODDS),
+        ("gravity_scale", {"s": -0.3}, 2 * ODDS),
+        ("buoyancy", {"b": 3.0}, 2 * ODDS),
+        ("clock_scale", {"s": 0.2}, ODDS),
         ("quadratic_drag", {"k": 4.0}, 0.0),
         ("clock_scale", {}, 0.0),
     ],
@@ -40,6 +43,15 @@ def test_of_what_flights_do_not_tell_apart_the_plausible_comes_first() -> None:
     found = {one.name: one for one in step.equals}
     assert list(found) == ["buoyancy", "clock_scale"]
     assert found["clock_scale"].odds == ODDS and found["buoyancy"].odds == 0
+
+
+def test_a_clock_that_is_wrong_by_a_fifth_comes_before_a_lift_by_a_third_of_the_weight() -> None:
+    slow = tosses(world_with("ball", {"clock_scale": {"s": 0.2}}, False), 4)
+    world, prepared = world_with("ball", None, False), prepare(world_with("ball", None, False), slow)
+    assert prepared.flight is not None
+    candidates = [Candidate(name, load_effect(name)) for name in ("buoyancy", "clock_scale", "gravity_scale")]
+    step = select_next(prepared.flight, world, candidates, [0] * len(slow), True)
+    assert [one.name for one in step.equals] == ["clock_scale", "buoyancy", "gravity_scale"]
 
 
 def test_an_episode_of_another_frame_rate_is_left_out() -> None:

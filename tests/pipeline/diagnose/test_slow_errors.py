@@ -166,7 +166,7 @@ def test_of_rivals_the_one_that_acts_alone_comes_first() -> None:
     def rival(name: str, bic: float) -> Evidence:
         refitted = SimpleNamespace(by_segment=[torch.tensor([1.0, 2.0, 3.0])])
         return cast(Evidence, SimpleNamespace(candidate=Candidate(name, load_effect(name)), name=name,
-                                              refitted=refitted, delta_bic=bic, repetition=None))  # fmt: skip
+                                              refitted=refitted, delta_bic=bic, odds=0.0, repetition=None))  # fmt: skip
 
     wind, tilt = rival("wind", -2.0), rival("gravity_tilt", -1.0)
     assert _with_unproven([wind], [wind, tilt], np.arange(3)) == [tilt, wind]
