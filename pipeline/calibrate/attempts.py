@@ -15,11 +15,20 @@ from ...schemas import CalibrateConfig, NotConvergedError
 from ...schemas.calibration import CalibrationAttempt, ImageVerdict, PairFigures, SelfCheckFigures
 from . import colmap
 from .camera_models import FIRST_TRIED, LADDER, richer, supported
-from .center_uncertainty import UNCERTAIN_CENTER, center_stds, focal_stds
+from .center_uncertainty import center_stds, focal_stds
 from .consistency_check import SelfCheck, check_model
 from .focal_prior import EXIF_STD, FocalLength, focal_lengths
-from .mapping import Mapped, adjusted, map_database, triangulated, with_focal_lengths, without_outliers
+from .mapping import (
+    Mapped,
+    adjusted,
+    map_database,
+    triangulated,
+    with_focal_lengths,
+    with_principal_points,
+    without_outliers,
+)
 from .photos import Inputs
+from .pose_posterior import principal_points
 from .reconstruction import SfmModel, VerifiedPair
 from .track_alignment import aligned
 from .turntable_cameras import TurntableCameras, on_turntable
@@ -32,6 +41,9 @@ MIN_REGISTERED_FRACTION = 0.5
 _LOW_PEAK_THRESHOLD = 0.002  # conventions: worked for weak texture
 _THOROUGH_TRIALS = 10000  # COLMAP's default: finds pairs with few true matches
 _TIGHT_RATIO = 0.7  # Lowe's test for repeated texture
+_ALIGN_ABOVE = 0.001
+"""Standard deviation of an optical centre, as a fraction of the extent of all, above which places of points in the
+photos are aligned to each other: before one is so uncertain that a warning is given."""
 _RICHEST_ON_TURNTABLE = "RADIAL"
 """Tangential distortion can hardly be told from a rotation of the camera where the camera always stands alike."""
 
@@ -142,6 +154,7 @@ def _attempt(
     models, camera_model = _models(database, inputs, settings.seed)
     focals: dict[str, FocalLength] = {}
     if models:
+        models[0] = _with_principal_points(models[0], camera_model, inputs, settings.seed)
         models[0], focals = _with_exif(models[0], camera_model, exif_px, inputs, settings.seed)
     pairs = tuple(
         replace(pair, image_a=names[pair.image_a], image_b=names[pair.image_b]) for pair in colmap.read_pairs(database)
@@ -204,7 +217,7 @@ def _supported(mapped: Mapped, start: str, inputs: Inputs, seed: int) -> tuple[M
 def _uncertain(mapped: Mapped, camera_model: str, inputs: Inputs) -> bool:
     """Return whether the centres are so uncertain that finer places of the points are worth their time."""
     model = mapped.model()
-    return max(center_stds(model, estimated(camera_model, model, inputs)).values()) > UNCERTAIN_CENTER
+    return max(center_stds(model, estimated(camera_model, model, inputs)).values()) > _ALIGN_ABOVE
 
 
 def _aligned(
@@ -237,6 +250,13 @@ def _all_seen(mapped: Mapped) -> bool:
 
 def _brightness(photo: Path) -> NDArray[np.float32]:
     return cv2.cvtColor(read_rgb(photo), cv2.COLOR_RGB2GRAY).astype(np.float32)
+
+
+def _with_principal_points(mapped: Mapped, camera_model: str, inputs: Inputs, seed: int) -> Mapped:
+    """Return a model whose principal points are off the middle as far as the observations say so."""
+    model = mapped.model()
+    models = estimated(camera_model, model, inputs)
+    return with_principal_points(mapped, principal_points(model, models), inputs.known, seed) if models else mapped
 
 
 def _with_exif(

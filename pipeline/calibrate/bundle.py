@@ -1,7 +1,8 @@
 """Bundle adjustment, linearised: what poses, intrinsics and points of a model do to its observations.
 
 The six numbers of a pose are the shift of its optical centre, along the axes of the world, and its rotation, about the
-axes of the camera (from the left). The intrinsics of the cameras follow, in COLMAP's order, then the points.
+axes of the camera (from the left). The intrinsics of the cameras follow, in COLMAP's order, where asked with the
+principal point behind them, then the points.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from .triangulation import cross_matrices, projection_jacobian
 
 POSE = 6
 """Numbers of a pose."""
+PRINCIPAL = 2
+"""Numbers of a principal point: its column and row."""
 _RIDGE = 1e-12
 """Relative weight that keeps a point with parallel rays from an infinite covariance."""
 
@@ -82,18 +85,21 @@ class ReducedEquations:
         return np.asarray(self.inverse @ slope).reshape(-1, 3)
 
 
-def linearized(model: SfmModel, models: Map[str, str], loss_px: float = np.inf) -> NormalEquations:
+def linearized(
+    model: SfmModel, models: Map[str, str], loss_px: float = np.inf, principal: bool = False
+) -> NormalEquations:
     """Return the normal equations of a model.
 
     Args:
         model: The model.
         models: COLMAP's camera model of each camera whose intrinsics are free.
         loss_px: Scale of a Cauchy loss [px], by which the observations are weighted.
+        principal: Whether the principal points of these cameras are free, too.
     """
     columns: dict[str, int] = {}
     size = POSE * len(model.T_cam_world)
     for camera, name in models.items():
-        columns[camera], size = size, size + LENS_PARAMETERS[name]
+        columns[camera], size = size, size + LENS_PARAMETERS[name] + (PRINCIPAL if principal else 0)
     matrix, right = np.zeros((size, size)), np.zeros(size)
     points, points_right = np.zeros((len(model.points), 3, 3)), np.zeros((len(model.points), 3))
     crossed, lengths = [], []
@@ -102,6 +108,8 @@ def linearized(model: SfmModel, models: Map[str, str], loss_px: float = np.inf) 
         pose, point, lens, residual = _jacobians(model, image, models.get(camera))
         own = np.arange(POSE * k, POSE * (k + 1))
         if camera in columns:
+            if principal:
+                lens = np.concatenate([lens, np.broadcast_to(np.eye(2), (len(lens), 2, PRINCIPAL))], 2)
             own = np.r_[own, columns[camera] + np.arange(lens.shape[2])]
         mine, seen = np.concatenate([pose, lens], 2), model.observations[image][1]
         lengths.append(np.linalg.norm(residual, axis=1))

@@ -22,7 +22,7 @@ from .reconstruction import Array, SfmCamera, SfmModel
 _MIN_MODEL_IMAGES = 3
 LOSS_SCALE = 2.0
 """Scale of the Cauchy loss, in standard deviations of a coordinate of the residuals."""
-_LEAST_NOISE_PX = 0.05
+LEAST_NOISE_PX = 0.05
 """Lower bound of that standard deviation [px]; without one, exact observations would have no scale."""
 _KEEP_WITHIN = (4.0, 3.0)
 """Residuals above this many standard deviations are taken for wrong matches, in turn, each after an adjustment."""
@@ -142,6 +142,20 @@ def with_focal_lengths(
     return Mapped(reconstruction=copy, names=mapped.names)
 
 
+def with_principal_points(
+    mapped: Mapped, points_px: Map[str, Array], known: Map[str, CameraIntrinsics], seed: int
+) -> Mapped:
+    """Give cameras of an adjusted model their principal points [px], shape (2,), and adjust all else again."""
+    copy = pycolmap.Reconstruction(mapped.reconstruction)
+    for identifier, camera in copy.cameras.items():
+        if mapped.names[identifier] in points_px:
+            values = np.array(camera.params)
+            values[camera.principal_point_idxs()] = points_px[mapped.names[identifier]]
+            camera.params = values.tolist()
+    _adjust(copy, _fixed(mapped, known), seed)
+    return Mapped(reconstruction=copy, names=mapped.names)
+
+
 def without_outliers(mapped: Mapped, known: Map[str, CameraIntrinsics], seed: int) -> Mapped:
     """Drop the observations of an adjusted model that are taken for wrong matches, and adjust it again, twice."""
     copy = pycolmap.Reconstruction(mapped.reconstruction)
@@ -185,7 +199,7 @@ def triangulated(mapped: Mapped, database: Path, root: Path, seed: int) -> Mappe
 
 def noise_px(residuals_px: Array) -> float:
     """Return the standard deviation of a coordinate of the residuals from their median length [px]."""
-    return max(float(np.median(residuals_px)) / _MEDIAN_OF_RAYLEIGH, _LEAST_NOISE_PX)
+    return max(float(np.median(residuals_px)) / _MEDIAN_OF_RAYLEIGH, LEAST_NOISE_PX)
 
 
 def _options(seed: int) -> Any:

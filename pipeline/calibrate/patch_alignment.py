@@ -58,6 +58,9 @@ class Templates:
     """Weighted derivatives, shape (point, grid, 8)."""
     inverse: Array
     """Inverse of their normal matrix, shape (point, 8, 8)."""
+    spread_px: Array
+    """Standard deviation of the place of a patch along the direction that it tells least, if what lies there differs by
+    as much as the patch itself varies [px], shape (point,)."""
 
 
 def templates(pictures: Pictures, photo: Ids, xy_px: Array) -> Templates:
@@ -75,7 +78,11 @@ def templates(pictures: Pictures, photo: Ids, xy_px: Array) -> Templates:
     normal = np.einsum("pga,pgb->pab", weighted, by)
     size = 1.0 / np.sqrt(np.maximum(np.einsum("paa->pa", normal), np.finfo(float).tiny))
     scaled = normal * size[:, :, None] * size[:, None] + _RIDGE * np.eye(8)
-    return Templates(values, weighted, np.linalg.inv(scaled) * size[:, :, None] * size[:, None])
+    inverse = np.linalg.inv(scaled) * size[:, :, None] * size[:, None]
+    weight = _WEIGHT / _WEIGHT.sum()
+    variance = ((values - (values @ weight)[:, None]) ** 2) @ weight
+    spread = np.sqrt(np.linalg.eigvalsh(inverse[:, :2, :2])[:, 1] * variance)
+    return Templates(values=values, weighted=weighted, inverse=inverse, spread_px=spread)
 
 
 def laid_over(

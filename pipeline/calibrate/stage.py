@@ -374,9 +374,9 @@ def _uncertain_rotations(stds_deg: dict[str, float]) -> list[str]:
     worst = max(uncertain, key=lambda image: stds_deg[image])
     return [
         f"the rotations of {len(uncertain)} of {len(stds_deg)} registered images are less certain than "
-        f"{UNCERTAIN_ROTATION_DEG:g} deg ({worst}: {stds_deg[worst]:.1f} deg), part of it since the principal point is "
-        "taken to be in the middle: known intrinsics ([[calibration.intrinsics]]) and more texture around the object "
-        "make them certain"
+        f"{UNCERTAIN_ROTATION_DEG:g} deg ({worst}: {stds_deg[worst]:.1f} deg): few matches tie them to the others, or "
+        "tell a rotation from a principal point off the middle; known intrinsics ([[calibration.intrinsics]]) and more "
+        "texture around the object make them certain"
     ]
 
 

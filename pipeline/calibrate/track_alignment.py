@@ -29,6 +29,8 @@ _LEAST_LIKE = (0.9, 0.95)
 _FAR_PX = 2.0
 """Most by which a patch may move from where it was matched, or where the model has it [px]."""
 _SETTLED_PX = 0.05
+_CERTAIN_PX = 0.1
+"""Most standard deviation of a place [px]. Along an edge a patch stays where the model has it, and would confirm it."""
 _VIEW_COS = 0.64
 """Least cosine between the mean direction from which a point is seen and one from which it is looked for: 50 deg."""
 _LEAST_VIEWS = 3
@@ -176,7 +178,8 @@ def _aligned(
     begun = maps[others] @ np.linalg.inv(maps[reference[own.point]] + _RIDGE * np.eye(2))
     places, like, step = laid_over(pictures, patches, own.photo, own.point, own.xy_px, begun)
     moved = np.linalg.norm(places - own.xy_px, axis=1)
-    found = (like > np.where(own.matched, *_LEAST_LIKE)) & (moved < _FAR_PX) & (step < _SETTLED_PX)
+    certain = patches.spread_px[own.point] * np.sqrt(np.maximum(1.0 - like**2, 0.0)) < _CERTAIN_PX
+    found = (like > np.where(own.matched, *_LEAST_LIKE)) & (moved < _FAR_PX) & (step < _SETTLED_PX) & certain
     result, good = seen.xy_px.copy(), np.ones(len(seen.point), bool)
     result[others[found]], good[others] = places[found], found
     return result, good

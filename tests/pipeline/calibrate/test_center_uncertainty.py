@@ -1,4 +1,4 @@
-"""The stated uncertainty of optical centres: the scatter of noisy adjustments, in any unit, larger where less ties."""
+"""The stated uncertainty of poses: the scatter of noisy adjustments, in any unit, larger where less ties."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cgwm.pipeline.calibrate import center_uncertainty
+from cgwm.pipeline.calibrate import pose_posterior
 from cgwm.pipeline.calibrate.center_uncertainty import center_stds, rotation_stds
 from cgwm.pipeline.calibrate.metric_scale import umeyama
+from cgwm.pipeline.calibrate.pose_posterior import posterior, principal_points
 from cgwm.pipeline.calibrate.reconstruction import SfmModel, Similarity
 from helpers.sfm_scene import make_scene, rotation_about
 from scipy.optimize import least_squares
@@ -22,9 +23,9 @@ def _scene(images: int = 6, points: int = 40) -> SfmModel:
     return make_scene(images=images, points=points, noise_px=0.0, outliers=0.0, seed=0)[0]
 
 
-def _noisy(model: SfmModel, seed: int) -> SfmModel:
+def _noisy(model: SfmModel, seed: int, noise_px: float = NOISE_PX) -> SfmModel:
     rng = np.random.default_rng(seed)
-    seen = {name: (xy + rng.normal(0, NOISE_PX, xy.shape), index) for name, (xy, index) in model.observations.items()}
+    seen = {name: (xy + rng.normal(0, noise_px, xy.shape), index) for name, (xy, index) in model.observations.items()}
     return replace(model, observations=seen)
 
 
@@ -57,8 +58,8 @@ def _adjusted(model: SfmModel) -> SfmModel:
 
 @pytest.mark.evidence  # 40 bundle adjustments by finite differences
 def test_equals_the_scatter_of_adjustments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(center_uncertainty, "SHARED_ERROR_PX", 0.0)
-    monkeypatch.setattr(center_uncertainty, "PRINCIPAL_STD", 0.0)  # the scene's is in the middle
+    monkeypatch.setattr(pose_posterior, "SHARED_VARIANCE", 1.0)
+    monkeypatch.setattr(pose_posterior, "PRINCIPAL_STD", 1e-6)  # the scene's is in the middle
     model = _scene()
     true, extent = model.centers(), np.linalg.norm(np.ptp(model.centers(), axis=0))
     off, stated, turned, stated_turns = [], [], [], []
@@ -81,18 +82,48 @@ def test_equals_the_scatter_of_adjustments(monkeypatch: pytest.MonkeyPatch) -> N
     assert np.median(stated_turns, 0) == pytest.approx(scatter, rel=0.3)
 
 
-def test_a_principal_point_off_the_middle_is_a_rotation(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = _scene(points=300)
-    stds, known = (np.array(list(rotation_stds(model, models).values())) for models in (MODELS, {}))
-    monkeypatch.setattr(center_uncertainty, "PRINCIPAL_STD", 0.0)
-    without, same = (np.array(list(rotation_stds(model, models).values())) for models in (MODELS, {}))
-    camera = model.cameras["photos"]
-    angle = np.sqrt(2) * 0.003 * np.hypot(camera.width, camera.height) / camera.focal_px
-    assert stds**2 - without**2 == pytest.approx(angle**2) and list(known) == list(same)
+def _with_middle(model: SfmModel, column: float, row: float) -> SfmModel:
+    """Return a model whose photos are what a camera with another principal point takes, or one that assumes it."""
+    return replace(model, cameras={"photos": replace(model.cameras["photos"], cx=column, cy=row)})
+
+
+def _seen_by(model: SfmModel) -> SfmModel:
+    seen = {}
+    for name, (_, index) in model.observations.items():
+        pose = model.T_cam_world[name]
+        seen[name] = (model.camera(name).project(model.points[index] @ pose[:3, :3].T + pose[:3, 3]), index)
+    return replace(model, observations=seen)
+
+
+def test_a_principal_point_off_the_middle_is_found_as_far_as_the_observations_tell_it() -> None:
+    true = _noisy(_seen_by(_with_middle(_scene(points=300), 324.0, 240.0)), 0, noise_px=0.1)
+    # an adjustment that takes it to be in the middle turns the cameras instead
+    turn = np.eye(4)
+    turn[:3, :3] = rotation_about([0, 1, 0], 4.0 / 600.0)
+    turned = {name: turn @ pose for name, pose in true.T_cam_world.items()}
+    found = principal_points(replace(_with_middle(true, 320.0, 240.0), T_cam_world=turned), MODELS)["photos"]
+    at = posterior(true, MODELS).principal_columns["photos"]
+    stds = np.sqrt(posterior(true, MODELS).variances[at : at + 2])
+    assert stds[0] < 0.5 and stds[1] > 1.5  # all cameras look down on one ring: its tilt takes the place of the row
+    assert found[0] == pytest.approx(324.0, abs=3 * stds[0]) and found[1] == pytest.approx(240.0, abs=stds[1])
+
+
+def test_a_photo_of_its_own_camera_does_not_tell_its_principal_point() -> None:
+    model = _noisy(_scene(points=300), 0, noise_px=0.1)
+    own = {**model.image_camera, "03.jpg": "other"}
+    two = replace(model, image_camera=own, cameras={**model.cameras, "other": model.cameras["photos"]})
+    models = {**MODELS, "other": "SIMPLE_PINHOLE"}
+    found = posterior(two, models)
+    prior = pose_posterior.PRINCIPAL_STD * 800.0
+    stds = {name: np.sqrt(found.variances[at : at + 2]) for name, at in found.principal_columns.items()}
+    assert stds["other"][0] > 2 * stds["photos"][0] and (stds["other"] < prior).all()
+    turns = rotation_stds(two, models)
+    assert turns["03.jpg"] == max(turns.values())
+    assert np.degrees(turns["03.jpg"]) > np.degrees(stds["other"].min() / 600.0) * 0.5
 
 
 def test_is_proportional_to_the_noise_and_free_of_place_and_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(center_uncertainty, "SHARED_ERROR_PX", 0.0)
+    monkeypatch.setattr(pose_posterior, "PRINCIPAL_STD", 1e-6)
     model = _noisy(_scene(points=300), 0)
     stds = np.array(list(center_stds(model, MODELS).values()))
     quarter = rotation_about([1, 0, 0], np.pi / 2)  # the box around the centres stays as large
@@ -101,11 +132,6 @@ def test_is_proportional_to_the_noise_and_free_of_place_and_unit(monkeypatch: py
     exact = _scene(points=300)
     twice = {n: (2 * xy - exact.observations[n][0], index) for n, (xy, index) in model.observations.items()}
     assert list(center_stds(replace(model, observations=twice), MODELS).values()) == pytest.approx(2 * stds, rel=1e-6)
-
-
-def test_shared_errors_do_not_average_out() -> None:
-    few, many = (np.median(list(center_stds(_scene(points=count), MODELS).values())) for count in (200, 2000))
-    assert many > 0.5 * few
 
 
 def test_a_photo_that_few_matches_tie_is_the_least_certain() -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.exif import photo_lens
-from cgwm.pipeline.calibrate import center_uncertainty
 from cgwm.pipeline.calibrate.center_uncertainty import center_stds, focal_stds
 from cgwm.pipeline.calibrate.focal_prior import EXIF_STD, FocalLength
 from cgwm.pipeline.calibrate.photos import gather
@@ -35,8 +34,7 @@ def test_a_contradiction_drops_the_exif_data() -> None:
     assert _focal(2000.0, 0.5).agree
 
 
-def test_the_focal_length_scatters_as_stated_and_exif_data_bound_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(center_uncertainty, "SHARED_ERROR_PX", 0.0)
+def test_the_focal_length_scatters_as_stated_and_exif_data_bound_it() -> None:
     model = make_scene(images=6, points=200, noise_px=0.5, outliers=0.0, seed=0)[0]
     models = {"photos": "RADIAL"}
     few = replace(model, observations={n: (xy[:8], index[:8]) for n, (xy, index) in model.observations.items()})

@@ -1,0 +1,180 @@
+"""Poses and intrinsics given the observations and what is known of lenses: how far the model is off, and how certain.
+
+With A the normal matrix of poses and intrinsics after elimination of the points, weighted as the robust loss of the
+adjustment weighs, the posterior's information is A / (f sigma^2) + 1 / s^2 on each number of which a prior with
+standard deviation s is known. It is inverted on the directions that are no similarity transform of the optical centres
+(inner constraints; Triggs et al. 2000, "Bundle adjustment - a modern synthesis", section 9), so that the covariance is
+that after the best similarity alignment of all centres.
+
+The factor f is there since observations share errors. Neighbouring patches hold the same pixels, a feature's place
+shifts with the direction of view, and what all observations of a place have in common is fitted by poses and points: no
+residual shows it, and no scatter between parts of the points does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from collections.abc import Mapping as Map
+from dataclasses import dataclass
+
+import numpy as np
+
+from .bundle import POSE, PRINCIPAL, linearized
+from .camera_models import LENS_PARAMETERS
+from .focal_prior import EXIF_STD
+from .mapping import LEAST_NOISE_PX, LOSS_SCALE, noise_px
+from .reconstruction import Array, SfmModel
+from .triangulation import cross_matrices
+from .turntable_motion import TurntableMotion
+
+SHARED_VARIANCE = 4.0
+"""Variance of the errors of poses, in units of that of independent errors: calibrated on photos of scanned objects with
+known cameras ([Thresholds](../../docs/thresholds.md))."""
+
+PRINCIPAL_STD = 0.003
+"""Standard deviation of a coordinate of the principal point about the middle, as a fraction of the picture's diagonal:
+a lens is centred on a sensor to some tenths of a millimetre."""
+
+_SIMILARITY = 7
+"""Numbers of a similarity transform."""
+_FLOOR = 1e-9
+"""Least information of a number that scales it, relative to the largest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posterior:
+    """Poses and intrinsics, principal points among them, given all that is known."""
+
+    step: Array
+    """From the model to the most probable numbers, shape (n,): in the order of `bundle.linearized`."""
+    variances: Array
+    """After the best similarity alignment of the centres, shape (n,)."""
+    focal_columns: dict[str, int]
+    """Column of the focal length of each camera whose intrinsics are estimated."""
+    principal_columns: dict[str, int]
+    """First column of its principal point."""
+
+
+def posterior(
+    model: SfmModel, models: Map[str, str], with_exif: Collection[str] = (), motion: TurntableMotion | None = None
+) -> Posterior:
+    """Return how far a model is from the most probable poses and intrinsics, and how certain these are.
+
+    Args:
+        model: The model, about at the minimum of its adjustment.
+        models: COLMAP's camera model of each camera whose intrinsics were estimated.
+        with_exif: Those cameras among them whose focal length EXIF data have told, too.
+        motion: The turntable that the poses were constrained to, whose axis is z; the numbers are then those of it.
+    """
+    lengths = linearized(model, {}).residuals_px
+    equations = linearized(model, models, LOSS_SCALE * noise_px(lengths), principal=True)
+    reduced, focal = equations.reduced(), equations.columns
+    principal = {camera: column + LENS_PARAMETERS[models[camera]] for camera, column in focal.items()}
+    size = len(reduced.matrix)
+    design = np.eye(size) if motion is None else _design(model, motion, size)
+    scale = 1.0 / (SHARED_VARIANCE * _noise_px(model, lengths, design.shape[1]) ** 2)
+    information, pull = scale * reduced.matrix, scale * reduced.right
+    for camera, column in principal.items():
+        offset, std = _about_the_middle(model, camera)
+        information[column : column + PRINCIPAL, column : column + PRINCIPAL] += np.eye(PRINCIPAL) / std**2
+        pull[column : column + PRINCIPAL] -= offset / std**2
+    for camera in with_exif:
+        known = 1.0 / (EXIF_STD * model.cameras[camera].focal_px) ** 2
+        information[focal[camera], focal[camera]] += known  # its mean is in the focal length already
+    basis = _basis(design, information, model.centers())
+    try:
+        inverse = np.linalg.inv(basis.T @ information @ basis)
+    except np.linalg.LinAlgError:
+        unknown = np.full(size, np.inf)
+        return Posterior(step=np.zeros(size), variances=unknown, focal_columns=focal, principal_columns=principal)
+    return Posterior(
+        step=basis @ (inverse @ (basis.T @ pull)),
+        variances=np.einsum("ij,jk,ik->i", basis, inverse, basis, optimize=True),
+        focal_columns=focal,
+        principal_columns=principal,
+    )
+
+
+def principal_points(model: SfmModel, models: Map[str, str]) -> dict[str, Array]:
+    """Return the most probable principal point [px], shape (2,), of each camera whose intrinsics were estimated.
+
+    Args:
+        model: The model, about at the minimum of its adjustment with the principal points that it has.
+        models: COLMAP's camera model of each of these cameras.
+    """
+    found, points = posterior(model, models), {}
+    for camera, column in found.principal_columns.items():
+        own = slice(column, column + PRINCIPAL)
+        # none is less certain than what is known of it without a photo, but for rounding where nothing is determined
+        if (found.variances[own] <= 1.001 * _about_the_middle(model, camera)[1] ** 2).all():
+            one = model.cameras[camera]
+            points[camera] = np.array([one.cx, one.cy]) + found.step[own]
+    return points
+
+
+def _about_the_middle(model: SfmModel, camera: str) -> tuple[Array, float]:
+    """Return the principal point from the middle of the picture [px], shape (2,), and its standard deviation [px]."""
+    one = model.cameras[camera]
+    offset = np.array([one.cx - 0.5 * one.width, one.cy - 0.5 * one.height])
+    return offset, PRINCIPAL_STD * float(np.hypot(one.width, one.height))
+
+
+def _noise_px(model: SfmModel, lengths: Array, numbers: int) -> float:
+    """Return the noise of a coordinate [px] of observations as the loss weighs them; infinite where all are used up.
+
+    Args:
+        model: The model.
+        lengths: Its reprojection errors [px], shape (observation,).
+        numbers: Free numbers of poses and intrinsics.
+    """
+    weights = 1.0 / (1.0 + (lengths / (LOSS_SCALE * noise_px(lengths))) ** 2)
+    seen = np.unique(np.concatenate([points for _, points in model.observations.values()]))
+    used = (numbers - _SIMILARITY + 3 * len(seen)) / (2 * len(lengths))
+    freedom = 2 * float(weights.sum()) * (1.0 - used)
+    if freedom <= 0:
+        return np.inf
+    return max(float(np.sqrt((weights * lengths**2).sum() / freedom)), LEAST_NOISE_PX)
+
+
+def _design(model: SfmModel, motion: TurntableMotion, size: int) -> Array:
+    """Return how poses and intrinsics change with the numbers of a turntable, and with its axis: four more numbers.
+
+    The axis is fixed in an adjustment. Here it may move, since centres are compared after the best similarity.
+    """
+    names = list(model.T_cam_world)
+    along = np.zeros((size, 4))
+    for k, pose in enumerate(model.T_cam_world.values()):
+        at = POSE * k
+        along[at : at + 2, :2] = np.eye(2)
+        along[at : at + 3, 2:] = -cross_matrices(model.center(names[k])[None])[0][:, :2]
+        along[at + 3 : at + 6, 2:] = -pose[:3, :2]
+    return np.concatenate([motion.design(names, size - POSE * len(names)), along], axis=1)
+
+
+def _basis(design: Array, information: Array, centers: Array) -> Array:
+    """Return the directions (n, m - 7) of the free numbers that are no similarity of the centres, scaled alike.
+
+    Args:
+        design: How poses and intrinsics change with the numbers that are free, shape (n, m).
+        information: Of poses and intrinsics, shape (n, n).
+        centers: Optical centres, shape (image, 3).
+    """
+    diagonal = np.einsum("ia,ij,ja->a", design, information, design, optimize=True)
+    # about zero for a motion of the axis of a turntable, which moves no image of a point
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, max(_FLOOR * diagonal.max(), np.finfo(float).tiny)))
+    along = design * scale
+    fixed = along.T @ _similarities(len(information), centers)
+    fixed /= np.maximum(np.linalg.norm(fixed, axis=0), np.finfo(float).tiny)
+    return along @ np.linalg.qr(fixed, mode="complete")[0][:, _SIMILARITY:]
+
+
+def _similarities(size: int, centers: Array) -> Array:
+    """Return the displacements of the centres under the seven similarities, in the rows of poses, shape (size, 7)."""
+    count, moves = len(centers), np.zeros((size, _SIMILARITY))
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    away = (centers - centers.mean(0)) / max(extent, np.finfo(float).tiny)
+    rows = (POSE * np.arange(count)[:, None] + np.arange(3)).ravel()
+    moves[rows, :3] = np.tile(np.eye(3), (count, 1))
+    moves[rows, 3:6] = -cross_matrices(away).reshape(-1, 3)
+    moves[rows, 6] = away.ravel()
+    return moves
