@@ -23,7 +23,7 @@ from ..segments.segment_fit import Refit, refit
 from ..segments.segments import Segments
 from ..trajectories.innovations import WHITE
 from .evidence import Evidence, prior_odds
-from .falsification import Repetition, repetition
+from .falsification import repetition
 from .score_test import ScoreTest, canonical_correlation, gain_by_episode, score_test
 from .session_scales import linearize_beside_scales
 from .thresholds import THRESHOLDS
@@ -112,7 +112,9 @@ def select_next(
     if not significant:
         return SelectionStep(tuple(evidence), tuple(evidence[:1]), False)
     done = _refitted_shortlist(significant, flight, world, linear, kept, variants, dispersion)
-    done = [replace(e, repetition=_repetition(e, linear, kept, variants, dispersion)) for e in done]
+    every = list(range(linear.base, len(linear.parameters)))
+    own = [linear.columns(_variant(e, kept, variants).parameters) for e in done]
+    done = [replace(e, repetition=repetition(linear, one, dispersion, every)) for e, one in zip(done, own, strict=True)]
     if not done:
         return SelectionStep(tuple(evidence), tuple(evidence[:1]), False)
     names = {e.name: e for e in done}
@@ -161,17 +163,6 @@ def repeats(evidence: Evidence, tested: int) -> bool:
     """
     found, level = evidence.repetition, LIMITS.alpha / max(1, tested)
     return found is not None and found.p_value < level and found.without_best < LIMITS.without_best
-
-
-def _repetition(
-    evidence: Evidence,
-    linear: Linearization,
-    candidates: Sequence[Candidate],
-    variants: Sequence[Variant],
-    dispersion: float,
-) -> Repetition:
-    """Return whether a candidate repeats from episode to episode, at the constants of its evidence."""
-    return repetition(linear, linear.columns(_variant(evidence, candidates, variants).parameters), dispersion)
 
 
 def _variant(evidence: Evidence, candidates: Sequence[Candidate], variants: Sequence[Variant]) -> Variant:

@@ -6,9 +6,10 @@ g, the statistic sum_u g_u' M_u^-1 g_u - g' M^-1 g is distributed as chi2. Its d
 parameters of all units less those of the common fit (Cochran's Q for several parameters).
 
 The same statistic tells how far a noise model can be believed: an effect that is the same in all episodes leaves a Q of
-its degrees of freedom where the model is right. Few episodes determine that ratio badly, so that the model counts for
-some more, as in moderated tests (Smyth 2004): with d of these, the scatter is (d + Q) / (d + dof), and the statistic of
-an effect over it is distributed as F.
+its degrees of freedom where the model is right. Few episodes determine that ratio badly for one effect, but all effects
+together have many such ratios, whose common value c is well known. So c counts for some more degrees of freedom, as in
+moderated tests (Smyth 2004): with d of these, the scatter is (d c + Q) / (d + dof), and the statistic of an effect over
+it is distributed as F.
 """
 
 from __future__ import annotations
@@ -162,22 +163,44 @@ class Repetition:
     """The same without the episode that speaks most for it; 1 where it is the only one."""
 
 
-def repetition(linear: Linearization, columns: Sequence[int], dispersion: float) -> Repetition:
+def repetition(
+    linear: Linearization, columns: Sequence[int], dispersion: float, beside: Sequence[int] = ()
+) -> Repetition:
     """Test an effect beside the scatter of its parameters between episodes.
 
     Args:
         linear: Linearization of the segments with the effect.
         columns: Columns of the effect's parameters.
         dispersion: Factor by which variances exceed those of the noise.
+        beside: Columns of all effects whose scatter tells the usual one; none where the noise model alone tells it.
     """
-    scatter, p_value = _beside_scatter(linear, columns, dispersion)
-    episodes = [int(one) for one in np.unique(linear.episode)]
-    without = [_beside_scatter(linear.without_episode(one), columns, dispersion)[1] for one in episodes]
-    return Repetition(scatter, p_value, max(without) if len(episodes) > 1 else 1.0)
+    names = [int(one) for one in np.unique(linear.episode)]
+    parts = (linear, *(linear.without_episode(one) for one in names if len(names) > 1))
+    found = [_beside_scatter(one, columns, dispersion, beside) for one in parts]
+    return Repetition(*found[0], max((p_value for _, p_value in found[1:]), default=1.0))
 
 
-def _beside_scatter(linear: Linearization, columns: Sequence[int], dispersion: float) -> tuple[float, float]:
+def _beside_scatter(
+    linear: Linearization, columns: Sequence[int], dispersion: float, beside: Sequence[int]
+) -> tuple[float, float]:
     """Return the scatter between episodes, and the p-value of an effect beside it."""
+    counts, usual = LIMITS.model_counts, 1.0
+    if beside:
+        # what a sum of squares falls below its expectation by is chance
+        q, dof = _scatter(linear, beside, dispersion)
+        usual, counts = max(1.0, (counts + q) / (counts + dof)), LIMITS.effects_count
+    q, dof = _scatter(linear, columns, dispersion)
+    scatter = max(1.0, (counts * usual + q) / (counts + dof))
+    test = score_test(linear, columns, dispersion=dispersion)
+    if not test.dof or not test.admissible:
+        return scatter, 1.0
+    tail = f_tail(test.statistic / test.dof / scatter, test.dof, counts + dof)
+    one_sided = test.dof == 1 and linear.parameters[columns[0]].bounds[0] == 0.0
+    return scatter, 0.5 * tail if one_sided else tail
+
+
+def _scatter(linear: Linearization, columns: Sequence[int], dispersion: float) -> tuple[float, int]:
+    """Return Cochran's Q of parameters over episodes, and its degrees of freedom."""
     chosen = [*range(linear.base), *columns]
     width = widths(linear, columns)
     count = len(widths(linear, chosen)) - len(width)
@@ -193,11 +216,4 @@ def _beside_scatter(linear: Linearization, columns: Sequence[int], dispersion: f
         explained, size = solved(matrix, left, width)[2:]
         statistic, rank = statistic + explained, rank + size
     common, size = solved(total, slope, width)[2:]
-    q, dof = max(statistic - common, 0.0) / dispersion, max(rank - size, 0)
-    scatter = max(1.0, (LIMITS.model_counts + q) / (LIMITS.model_counts + dof))
-    test = score_test(linear, columns, dispersion=dispersion)
-    if not test.dof or not test.admissible:
-        return scatter, 1.0
-    tail = f_tail(test.statistic / test.dof / scatter, test.dof, LIMITS.model_counts + dof)
-    one_sided = test.dof == 1 and linear.parameters[columns[0]].bounds[0] == 0.0
-    return scatter, 0.5 * tail if one_sided else tail
+    return max(statistic - common, 0.0) / dispersion, max(rank - size, 0)

@@ -218,11 +218,19 @@ class VerdictThresholds:
         4.0,
         "episodes",
         "degrees of freedom for which the noise model counts in the scatter of an effect between episodes, beside "
-        "correlated errors",
+        "correlated errors, where no other effects tell the usual scatter",
         "real-like development, half of the captures, of 2, 4, 6 and 8: the largest without a wrong name in 35 nulls",
         "as estimated from the scatter of all candidates in 102 captures without an effect in flight (Smyth 2004): 3.2 "
-        "and 6.0 on halves; with 6 one of 95 nulls is wrong at the first step, with 4 none",
-        (0, 95),
+        "and 6.0 on halves",
+    )
+    effects_count: float = threshold(
+        9.0,
+        "episodes",
+        "degrees of freedom for which the usual scatter of all effects counts in that of one",
+        "real-like development: the median over ten effects of what the scatter in 165 captures without an effect in "
+        "flight says (Smyth 2004; 4 to 18), where the noise model alone counts for 3 to 9",
+        "first step, the same captures: significant in 29 of 38 with an effect, and 2 false ones of 164; 28 and 3 with "
+        "the noise model alone",
     )
     consistent_share: float = threshold(0.9, "1", "see `consistent_p`", error_rates="see `consistent_p`")
     better_chi2: float = threshold(

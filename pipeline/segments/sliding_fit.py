@@ -16,6 +16,7 @@ from torch import Tensor
 from ..physics.contact_law import ContactLaw
 from ..physics.parameters import FRICTION, GROUND_SHIFT, Parameter, effect_parameters
 from ..physics.world import State, World
+from ..trajectories.bursts import without_grounded_bursts
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals
 from .candidates import Variant, base_parameters, base_values, with_variants
 from .linearization import linearize, sums
@@ -66,6 +67,7 @@ class StartedSliding:
         """
         if not isinstance(world.contact, ContactLaw) or not prepared.has_orientation:
             return None
+        prepared = replace(prepared, observations=without_grounded_bursts(prepared.observations, prepared.airborne))
         items = find_sliding_segments(world, prepared.observations, prepared.airborne, prepared.noise)
         if not items:
             return None

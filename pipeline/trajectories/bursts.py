@@ -1,10 +1,10 @@
-"""Bursts: rows of wrong measurements within a flight, whose frames before and after them lie on one smooth path.
+"""Bursts: rows of wrong measurements within a motion, whose frames before and after them lie on one smooth path.
 
 What nothing pushes follows a low polynomial, its marker with what the measured turn adds, and both sides of a wrong row
 lie on the same one; after a contact they do not. Leaving out frames R lowers the sum of squares of a linear fit with
 residuals e and projector H by e_R' (1 - H_RR)^-1 e_R, whatever was measured there. A row is wrong where this is more
 than `LIMITS.burst_share` times what its frames have elsewhere, what is left of the flight is as quiet as others, and no
-change of the velocity within the row explains it better.
+change of the velocity within the row explains it better. A body on the ground follows such a path between impacts.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from torch import Tensor
 
 from ..geometry.rotation import continuous_turns, quat_to_matrix
 from .observations import Observations
@@ -34,6 +35,9 @@ LEAST_TURNED = 0.5
 """Share of the frames whose turn is measured from which that of the others is interpolated."""
 LEAST_FREE = 8
 """Fewest frames of a flight beside a burst and the coefficients of its path."""
+GROUNDED_S = 0.3
+"""Length [s] of the half-overlapping pieces of a motion on the ground that are looked at, three of the longest bursts.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +109,35 @@ def bursts(whole: Observations, flight: Sequence[Segment], kind: int) -> Iterato
         found = _found(path, sigma)
         if len(found):
             yield path.episode, found, path.column
+
+
+def without_grounded_bursts(whole: Observations, airborne: Tensor) -> Observations:
+    """Mark the bursts of motions on the ground as not measured.
+
+    Args:
+        whole: The episodes (E).
+        airborne: Airborne frames (E, T).
+    """
+    pieces = list(_grounded(whole, airborne))
+    seen, turned = whole.seen.clone(), whole.has_orientation.clone()
+    for kind in (1, 0):  # a wrong turn would move a marker beside the centre of mass
+        whole = replace(whole, seen=seen.clone(), has_orientation=turned.clone())
+        for episode, frames, column in bursts(whole, pieces, kind):
+            (seen, turned)[kind][episode, frames, column] = 0.0
+    return replace(whole, seen=seen, has_orientation=turned)
+
+
+def _grounded(whole: Observations, airborne: Tensor) -> Iterator[Segment]:
+    """Yield half-overlapping pieces of the motions on the ground."""
+    for episode, times in enumerate(whole.times_s.numpy()):
+        frames = np.flatnonzero((~airborne[episode] & (whole.seen[episode].amax(-1) > 0)).numpy())
+        if len(frames) < 2:
+            continue
+        length = round(GROUNDED_S / float(np.median(np.diff(times[frames]))))
+        for run in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1):
+            last = max(len(run) - 1 - length, 0)
+            for first in sorted({*range(0, last, max(length // 2, 1)), last}):
+                yield Segment(episode, int(run[first]), int(run[min(first + length, len(run) - 1)]))
 
 
 def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path | None:

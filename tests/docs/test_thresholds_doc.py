@@ -201,6 +201,7 @@ TRACK_NUMERICS = {
     ),
     "window of an estimate, and the polynomial in it": (
         "bursts.DEGREES",
+        "bursts.GROUNDED_S",
         "bursts.KEPT, ROUNDING",
         "bursts.LEAST_FREE",
         "bursts.LEAST_TURNED",

@@ -457,6 +457,30 @@ def test_what_is_named_shows_beside_the_scatter_of_episodes(
     assert repeats(evidence, 5) == named
 
 
+def test_the_scatter_of_all_effects_tells_what_that_of_one_may_be_by_chance() -> None:
+    """Six effects whose scores scatter three times as the noise says, and one among them whose scores hardly do."""
+    rng, count = np.random.default_rng(0), 6
+    scores = np.concatenate((np.full((5, 1), 2.0), 3 * rng.standard_normal((5, count))), 1)
+    linear = one_parameter(np.ones(5), scores[:, 0])
+    parameters = tuple(replace(linear.parameters[0], name=f"p{k}") for k in range(count + 1))
+    linear = replace(
+        linear,
+        parameters=parameters,
+        information=np.broadcast_to(np.eye(count + 1), (5, count + 1, count + 1)),
+        score=scores,
+        prior=np.zeros(count + 1),
+    )
+    every = range(count + 1)
+    q, dof = float(np.square(scores - scores.mean(0)).sum()), 4 * (count + 1)
+    limits = THRESHOLDS.verdict
+    usual = (limits.model_counts + q) / (limits.model_counts + dof)
+    found, alone = repetition(linear, [0], 1.0, every), repetition(linear, [0], 1.0)
+    assert alone.scatter == 1.0 and usual > 3
+    assert found.scatter == pytest.approx(limits.effects_count * usual / (limits.effects_count + 4))
+    t = 10.0 / np.sqrt(5 * found.scatter)
+    assert found.p_value == pytest.approx(2 * student_tail(t, limits.effects_count + 4), rel=1e-6)
+
+
 def test_steps_in_flight_are_short_enough_for_fine_measurements() -> None:
     """Through a noise of 0.05 mm the error of a drag in steps of 2.5 ms looked like buoyancy or another scale."""
     truth, world = world_with("cube", {"linear_drag": {"c": 0.6}}, ground=False), world_with("cube", ground=False)

@@ -1,9 +1,12 @@
 """Bursts of wrong measurements in flights: rows that the frames around them contradict, and nothing else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.trajectories.bursts import bursts
+from cgwm.pipeline.trajectories.bursts import bursts, without_grounded_bursts
 from cgwm.pipeline.trajectories.flight_noise import without_outliers
 from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -67,3 +70,34 @@ def test_a_burst_near_others_does_not_count_as_a_touch() -> None:
     seen, count, touched = without_outliers(whole, flight, Noise(*NOISE))
     assert 16 <= count <= 20 and not bool(touched.any())
     assert not bool(seen.seen[:, 16:19].any(1).all())
+
+
+@pytest.mark.parametrize(("wrong", "stops_s"), [((30, 36), 9.0), ((70, 75), 9.0), (None, 9.0), (None, 0.42)])
+def test_a_burst_of_a_slide_is_left_out_and_where_it_stops_nothing_is(
+    wrong: tuple[int, int] | None, stops_s: float
+) -> None:
+    world, episodes = flights()
+    whole, rng = whole_episodes(world, [episodes[0]] * 2), np.random.default_rng(7)  # pyright: ignore[reportArgumentType]
+    times = torch.arange(100, dtype=torch.float64) * 0.01
+    slid = times.clamp_max(stops_s)
+    place = (2.0 * slid - 1.5 * slid**2)[:, None] * torch.tensor([1.0, 0.3, 0.0])
+    place = place.expand(2, -1, -1) + 5e-4 * torch.from_numpy(rng.standard_normal((2, 100, 3)))
+    if wrong is not None:
+        place[1, slice(*wrong)] += 6e-3 * torch.from_numpy(rng.standard_normal((wrong[1] - wrong[0], 3)))
+    still = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(2, 100, 1, 4)
+    seen = torch.ones(2, 100, 1, dtype=torch.float64)
+    slides = replace(
+        whole,
+        times_s=times.expand(2, -1),
+        position_m=place[:, :, None],
+        quat_wxyz=still,
+        seen=seen,
+        has_orientation=seen,
+    )
+    left = without_grounded_bursts(slides, torch.zeros(2, 100, dtype=torch.bool))
+    lost = (left.seen[..., 0] == 0).nonzero().tolist()
+    if wrong is None:
+        assert not lost
+    else:
+        assert {episode for episode, _ in lost} == {1} and len(lost) >= 3
+        assert {frame for _, frame in lost} <= set(range(*wrong))
