@@ -161,7 +161,7 @@ def repeats(evidence: Evidence, tested: int) -> bool:
     No model of correlated errors is exact: a burst, the smeared edge of a contact or the rest of a hand looks like a
     force, in its own episode.
     """
-    found, level = evidence.repetition, LIMITS.alpha / max(1, tested)
+    found, level = evidence.repetition, LIMITS.repeated_alpha / max(1, tested)
     return found is not None and found.p_value < level and found.without_best < LIMITS.without_best
 
 

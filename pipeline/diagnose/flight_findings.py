@@ -116,15 +116,16 @@ class FlightFindings:
         """Whether the selected effects imitate something else.
 
         Their parameters change from episode to episode, their law is another one, a law of any form explains more of
-        what repeats than they do, or what differs from episode to episode follows a law of the motion and they do not
-        explain nearly all that the model lacks.
+        what repeats than they do, or what differs from episode to episode follows a law of the motion and they neither
+        explain nearly all that the model lacks nor repeat with the same parameters.
         """
         inconsistent = self.agreement is not None and self.agreement.doubtful
         # what is left is known where it is a constant force: a candidate, and no other law that the effects imitate
         least = LIMITS.constant_share if self.left_constant else LIMITS.common_share
         imitated = self.repeats and self.common_share < least
         most = bool(self.in_flight) and self.explained_share >= LIMITS.enough_share
-        follows = self.own_law is not None and not most
+        steady = self.predicts and self.agreement is not None and self.agreement.share >= LIMITS.consistent_share
+        follows = self.own_law is not None and not (most or steady)
         other = bool(self.fleeting) or any(one.better for one in self.others)
         return inconsistent or imitated or follows or other
 

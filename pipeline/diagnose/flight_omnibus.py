@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ..physics.world import World
 from ..segments.prepare import Prepared
-from ..segments.residual_wrench import Omnibus, ResidualWrenches, omnibus, residual_wrenches
+from ..segments.residual_wrench import Omnibus, ResidualWrenches, omnibus, residual_wrenches, sound_windows
 from ..segments.segments import Segments
 from .thresholds import THRESHOLDS
 
@@ -14,9 +14,9 @@ LIMITS = THRESHOLDS.verdict
 
 
 def flight_windows(prepared: Prepared, world: World) -> list[tuple[Segments, ResidualWrenches]]:
-    """Cut the flights into windows of each length of the omnibus test and estimate their residual wrenches."""
+    """Cut the flights into windows of each length of the omnibus test and estimate residual wrenches of sound ones."""
     cut = [windows for longest_s in LIMITS.omnibus_s if (windows := prepared.pieces(world, longest_s)) is not None]
-    return [(windows, residual_wrenches(windows)) for windows in cut]
+    return [sound_windows(windows, residual_wrenches(windows)) for windows in cut]
 
 
 def worst_omnibus(windows: Sequence[tuple[Segments, ResidualWrenches]], scatter: float) -> Omnibus | None:

@@ -30,6 +30,15 @@ class FlightThresholds:
         "1.4 mm and more",
         (1, 1000),
     )
+    repeated_alpha: float = threshold(
+        0.005,
+        "probability",
+        "beside correlated errors, the same beside the scatter between episodes, which few episodes tell",
+        "real-like development, first step: the largest of 0.002 to 0.02 at which none of 158 captures without an "
+        "effect in flight is significant",
+        "the same captures: 88 of 119 effects of flight and measurement are significant, 82 with 0.002, 90 with 0.02 "
+        "and two false ones",
+    )
     shortlist: int = threshold(5, "effects", "how many of the most significant candidates are refitted")
     shortlist_share: float = threshold(
         0.4, "1", "down to which share of the largest score statistic candidates are refitted"

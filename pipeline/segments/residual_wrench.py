@@ -27,6 +27,7 @@ from ..trajectories.track_noise import Noise
 from .segment_fit import linearised
 from .segment_states import fit_states
 from .segments import Segments
+from .thresholds import SEGMENT_THRESHOLDS
 
 Array = NDArray[np.float64]
 
@@ -76,6 +77,18 @@ class ResidualWrenches:
     def covariance(self) -> Array:
         """Covariances (n, 6, 6)."""
         return np.linalg.inv(self.information + np.eye(6) / WEAK_STD**2).astype(np.float64)
+
+    def select(self, chosen: Sequence[int]) -> ResidualWrenches:
+        """Return the residual wrenches of chosen windows."""
+        kept = list(chosen)
+        return ResidualWrenches(
+            segments=tuple(self.segments[k] for k in kept),
+            wrench=self.wrench[kept],
+            information=self.information[kept],
+            coordinates={name: values[kept] for name, values in self.coordinates.items()},
+            velocity=self.velocity[kept],
+            omega=self.omega[kept],
+        )
 
 
 @dataclass(frozen=True)
@@ -189,15 +202,43 @@ def omnibus(found: ResidualWrenches, scatter: float = 1.0) -> Omnibus:
     return Omnibus(chi2 / max(dof, 1e-9), dof, chi2_tail(chi2, max(dof, 1e-9)))
 
 
+def sound_windows(segments: Segments, found: ResidualWrenches) -> tuple[Segments, ResidualWrenches]:
+    """Leave out windows that scatter far more than the quietest quarter does, whatever wrench acts in them.
+
+    They hold a contact, the end of a hand, a burst, or a state that was not found; one of them would pass for noise of
+    all. All windows count where fewer than half would be left.
+
+    Args:
+        segments: The windows with fitted states.
+        found: Their residual wrenches.
+    """
+    chi2, dof = _left(segments, found)
+    told = dof >= 1
+    if not told.any():
+        return segments, found
+    size = chi2 / np.maximum(dof, 1.0)
+    most = SEGMENT_THRESHOLDS.slow_errors.unsound * max(1.0, float(np.quantile(size[told], 0.25)))
+    kept = np.flatnonzero(~told | (size <= most)).tolist()
+    if len(kept) == len(size) or len(kept) < len(size) / 2:
+        return segments, found
+    return segments.select(kept), found.select(kept)
+
+
 def dispersion(segments: Segments, found: ResidualWrenches) -> float:
     """Return the factor, at least 1, by which short pieces scatter more than the stated noise under any wrench.
 
     Noise that is correlated from frame to frame, as of filtered tracks, shows here.
     """
-    chi2 = float(segments.residuals([], segments.world.gravity.new_zeros(0), jacobian=False)[0].square().sum())
-    gained = float(np.einsum("ni,nij,nj->", found.wrench, found.information, found.wrench))
-    taken = float(np.einsum("nij,nji->", found.information, found.covariance))
-    return max(1.0, (chi2 - gained) / max(float(segments.dof.sum()) - taken, 1.0))
+    chi2, dof = _left(segments, found)
+    return max(1.0, float(chi2.sum()) / max(float(dof.sum()), 1.0))
+
+
+def _left(segments: Segments, found: ResidualWrenches) -> tuple[Array, Array]:
+    """Return chi2 and degrees of freedom (n) of windows beside their residual wrenches."""
+    residuals = segments.residuals([], segments.world.gravity.new_zeros(0), jacobian=False)[0]
+    gained = np.einsum("ni,nij,nj->n", found.wrench, found.information, found.wrench)
+    taken = np.einsum("nij,nji->n", found.information, found.covariance)
+    return residuals.square().sum((1, 2)).numpy() - gained, segments.dof.numpy() - taken
 
 
 def covariates_of(found: ResidualWrenches) -> list[Covariate]:

@@ -117,7 +117,7 @@ def _of_flights(
 ) -> tuple[SlowErrors | None, list[Segment]]:
     """Return the variance components of chosen flights, and those of them that count for nothing.
 
-    The components are None where the tracks' noise explains the flights.
+    The components are None where the tracks' noise explains the flights, and all count.
     """
     fitted = fit_states(prepared.segments("flight", world, items))
     plain = Segments.of("flight", world, prepared.observations, items, prepared.noise, WHITE)
@@ -140,7 +140,7 @@ def _of_flights(
         still.append(parts[1])
         evidence, sway_evidence = max(evidence, parts[2]), max(sway_evidence, parts[3])
     model = NoiseModel(*found)
-    if not model.slow and model == prepared.noise_model:
+    if not model.slow and model == prepared.noise_model and not wrong:
         return None, wrong
     return SlowErrors(model, NoiseModel(*still), evidence, sway_evidence, ()), wrong
 
