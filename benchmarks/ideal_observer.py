@@ -1,21 +1,27 @@
 """What an observer could name in real-like captures who knows the true errors: the limit of any rule.
 
     python benchmarks/missing_effects.py run --stage development --each 6 --nulls 3 --contenders cgwm
-    python benchmarks/ideal_observer.py --stage development [--only flight]
+    python benchmarks/ideal_observer.py --stage development [--only flight] [--workers 2] [--out FILE] [--answers STORE]
 
-For each capture with one effect of flight or measurement that `missing_effects.py` has made, the true effect, as large
-as it is, is projected on what whole flights show: generalised least squares with the true covariance of the errors
+For each capture with effects of flight or measurement that `missing_effects.py` has made, each true effect, as large as
+it is, is projected on what whole flights show: generalised least squares with the true covariance of the errors
 (white, slow, bursts at their true times) and the true variances of tilts and scales, states free. `chi2` is its square
 in standard errors, what a test of this one effect expects beside chance; `apart` is what the best effect of another
-class leaves of it. Smoothing is left out, as it can be undone. A magnet has another law than cgwm's, and is left out.
+class leaves of it. Smoothing is left out, as it can be undone, and so are a magnet, whose law is not cgwm's, and a
+wind, which does nothing without its drag. An effect is nameable with five standard errors (`NAMEABLE`), half of whose
+square no other class explains; with `--answers` the recall of a run of `missing_effects.py` is printed for what is
+nameable, too: no rule that seldom names anything wrong can have much more.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +30,7 @@ import numpy as np
 import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.models.model import read_model
+from cgwm.datasets.synthetic.hidden_effects import EFFECTS
 from cgwm.pipeline.diagnose.stage import library_of, prepared_world
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.segments.candidates import acts_in, admissible, variants_of
@@ -32,16 +39,19 @@ from cgwm.pipeline.segments.prepare import whole_flights
 from cgwm.pipeline.segments.segment_states import fit_states
 from cgwm.pipeline.segments.segments import Segments
 from cgwm.pipeline.trajectories.innovations import WHITE
+from cgwm.schemas import CgwmError
+from diagnose import base_settings
 from real_like import STAGES
 from real_like.errors import Errors, slow_correlation
-from real_like.score import EQUIVALENT, rate
+from real_like.score import EQUIVALENT, RIGHT, judge, rate, ratio_of
 from store import ROOT
 
 LEAST_FRAMES = 6
 MEASURED = 0.04
 """A direction of parameters counts where its information times the variance of the prior is above this."""
-LIMITS = (16.0, 25.0)
-"""Squares of 4 and of 5 standard errors: a test of 15 candidates at 0.002 asks for 3.8."""
+NAMEABLE = (25.0, 12.5)
+"""Least `chi2` and `apart`, as of `contact_observer.py`: a test of 15 candidates at 0.002 asks for 14.6, and the effect
+itself scatters by one standard error about its size."""
 BINS = ((0.0, 17.0), (17.0, np.inf))
 """Ratios of the effect to the slow error: small and large ones."""
 
@@ -157,38 +167,107 @@ def _explained(found: Seen, score: Array, name: str) -> float:
     return float(np.square(vectors[:, kept].T @ (score[own] * width) / np.sqrt(values[kept])).sum())
 
 
+def observed(truth: dict[str, Any], capture: Path, model: Path) -> dict[str, Any]:
+    """Return what the ideal observer sees of the effects of a capture; None of those that are left out."""
+    if not model.is_dir():
+        fit(capture, model, stage="phys-geo", phys_config=base_settings("tracks"))
+    found = seen(model, capture, truth)
+    limits = {effect["name"]: limit(found, effect) for effect in truth["effects"] if effect["name"] in found.names}
+    limits |= {name: None for name in limits if name == "ground_magnet"}
+    return {"case": truth["name"], "limits": {e["name"]: limits.get(e["name"]) for e in truth["effects"]}}
+
+
+def is_nameable(found: Sequence[float] | None) -> bool | None:
+    """Return whether an effect with these `chi2` and `apart` is nameable; None of one that is left out."""
+    return None if found is None else found[0] > NAMEABLE[0] and found[1] > NAMEABLE[1]
+
+
+def table(rows: Sequence[dict[str, Any]], truths: dict[str, Any], answers: dict[str, Any]) -> str:
+    """Return how many effects are nameable, and how many of these were named, by their size and of pairs."""
+    single, lines = [row for row in rows if len(row["limits"]) == 1], []
+    for low, high in BINS:
+        inside = [row for row in single if low <= (ratio_of(truths[row["case"]]) or 0.0) < high]
+        told = [(row, is_nameable(*row["limits"].values())) for row in inside]
+        told = [(row, one) for row, one in told if one is not None]
+        lines.append(f"ratio from {low:g} to {high:g}: nameable {rate([one for _, one in told])}")
+        lines += _named(f"ratio from {low:g} to {high:g}", [row for row, one in told if one], truths, answers)
+    pairs = [row for row in rows if len(row["limits"]) == 2]
+    told = [(row, [is_nameable(one) for one in row["limits"].values()]) for row in pairs]
+    told = [(row, both) for row, both in told if None not in both]
+    lines.append(f"pairs of flight and measurement: both nameable {rate([all(both) for _, both in told])}")
+    return "\n".join([*lines, *_named("pairs", [row for row, both in told if all(both)], truths, answers)])
+
+
+def _named(what: str, rows: Sequence[dict[str, Any]], truths: dict[str, Any], answers: dict[str, Any]) -> Iterator[str]:
+    """Yield a line that says how many of some nameable captures were named, for each contender."""
+    for who, own in answers.items():
+        marks = [judge(truths[row["case"]], own.get(row["case"]))["mark"] in RIGHT for row in rows]
+        yield f"{what}: of those nameable {who} names {rate(marks)}"
+
+
+def _answers(path: Path) -> dict[str, Any]:
+    """Return the answers in a store of `missing_effects.py`, by contender and case."""
+    found: dict[str, Any] = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        if "contender" in row:
+            found.setdefault(row["contender"], {})[row["case"]] = row.get("answer")
+    return found
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Print what an ideal observer sees of each capture, and how often it is enough."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--stage", choices=STAGES, default="development")
     parser.add_argument("--captures", type=Path, default=None, help="as of missing_effects.py")
     parser.add_argument("--only", default="", help="part of the name")
+    parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no capture after this time")
+    parser.add_argument("--out", type=Path, default=None, help="file of the results, JSON lines; known cases are kept")
+    parser.add_argument("--answers", type=Path, default=None, help="store of missing_effects.py: recall of what is")
     given = parser.parse_args(words)
-    captures = given.captures or ROOT / "out" / "real_like" / given.stage
-    rows: list[tuple[float, float, float]] = []
-    for path in sorted(captures.with_name(f"{captures.name}.truth").glob("*.json")):
-        truth = json.loads(path.read_text(encoding="utf-8"))
-        if truth["row"] not in ("flight", "measurement") or given.only not in truth["name"]:
-            continue
-        effect, model = truth["effects"][0], captures.with_name(f"{captures.name}.models") / path.stem
-        if effect["name"] == "ground_magnet":
-            continue
-        if not model.is_dir():
-            fit(captures / path.stem, model, stage="phys-geo")
-        found = limit(seen(model, captures / path.stem, truth), effect)
-        if found is not None:
-            rows.append((effect["ratio"], *found))
-            print(
-                f"{truth['name']}: ratio {effect['ratio']:.1f}, chi2 {found[0]:.1f}, apart {found[1]:.1f}", flush=True
-            )
-    for low, high in BINS:
-        inside = [row for row in rows if low <= row[0] < high]
-        for least in LIMITS:
-            enough = rate([row[1] > least and row[2] > least / 2 for row in inside])
-            print(
-                f"ratio from {low:g} to {high:g}: above {np.sqrt(least):g} standard errors and apart by half: {enough}"
-            )
+    captures, deadline = given.captures or ROOT / "out" / "real_like" / given.stage, time.monotonic() + given.seconds
+    models = captures.with_name(f"{captures.name}.models")
+    paths = sorted(captures.with_name(f"{captures.name}.truth").glob("*.json"))
+    truths = {one["name"]: one for one in (json.loads(path.read_text(encoding="utf-8")) for path in paths)}
+    truths = {name: one for name, one in truths.items() if _is_asked(one) and given.only in name}
+    lines = given.out.read_text(encoding="utf-8").splitlines() if given.out and given.out.is_file() else []
+    rows = [json.loads(line) for line in lines]
+    todo = [one for name, one in truths.items() if name not in {row["case"] for row in rows}]
+    with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        places = [one["name"].replace("/", "__") for one in todo]
+        futures = [
+            pool.submit(_within, one, captures / place, models / place, deadline)
+            for one, place in zip(todo, places, strict=True)
+        ]
+        for future in as_completed(futures):
+            row = future.result()
+            if row is None:
+                continue
+            rows.append(row)
+            print(json.dumps(row), flush=True)
+            if given.out:
+                with given.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(row) + "\n")
+    rows = [row for row in rows if row["case"] in truths]
+    print(table(rows, truths, _answers(given.answers) if given.answers else {}))
     return 0
+
+
+def _is_asked(truth: dict[str, Any]) -> bool:
+    """Return whether all effects of a capture act in flight or in the measurement."""
+    acts = [EFFECTS[effect["name"]].acts for effect in truth["effects"]]
+    return bool(acts) and set(acts) <= {"flight", "measurement"}
+
+
+def _within(truth: dict[str, Any], capture: Path, model: Path, deadline: float) -> dict[str, Any] | None:
+    """Return what the observer sees, None after the deadline or where the capture is refused."""
+    if time.monotonic() > deadline:
+        return None
+    try:
+        return observed(truth, capture, model)
+    except CgwmError:
+        return None
 
 
 if __name__ == "__main__":
