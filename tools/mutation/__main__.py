@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=300, help="mutants of the sample")
     parser.add_argument("--seed", type=int, default=1, help="seed of the sample")
     parser.add_argument("--budget", type=float, default=20.0, help="seconds of tests for each mutant")
+    parser.add_argument("--limit", type=float, help="seconds that the map may take; default: until all tests have run")
     parser.add_argument("--folders", nargs="+", default=list(FOLDERS), help="folders to change")
     parser.add_argument("--without", nargs="*", default=[], help="tests that do not count")
     options, words = parser.parse_known_args()
@@ -41,7 +42,7 @@ def main() -> None:
     work = (options.work or root / "build" / "mutants").resolve()
     work.mkdir(parents=True, exist_ok=True)
     if options.what == "map":
-        make_map(root, work, options.jobs, words)
+        make_map(root, work, options.jobs, options.limit, words)
     elif words:
         parser.error(f"unknown arguments: {words}")
     elif options.what == "list":

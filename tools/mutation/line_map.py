@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -19,10 +20,11 @@ PACKAGES = {"cgwm_cli": "cli", "schemas": "schemas", "datasets": "datasets", "pi
 
 
 class LineMap:
-    """Plugin of pytest: lines of the product by test, with the seconds of each test that passes."""
+    """Plugin of pytest: lines of the product by test, with the seconds of each test that passes, as they end."""
 
     def __init__(self, root: Path, target: Path) -> None:
-        self.root, self.target = root, target
+        self.root = root
+        self.file = (target / f"map-{os.environ.get('PYTEST_XDIST_WORKER', 'main')}.jsonl").open("w", buffering=1)
         self.prefixes = {str((root / folder).resolve()) + os.sep: folder for folder in PACKAGES}
         self.names: dict[str, str | None] = {}
         self.lines: set[tuple[str, int]] = set()
@@ -80,17 +82,14 @@ class LineMap:
         entry["passed"] &= report.passed
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
-        """Keep the lines of a test."""
+        """Write the lines of a test that passed."""
         by_file: dict[str, list[int]] = defaultdict(list)
         for path, line in self.lines:
             by_file[path].append(line)
-        self.tests.setdefault(nodeid, {"passed": False})["lines"] = {p: sorted(v) for p, v in by_file.items()}
-
-    def pytest_sessionfinish(self) -> None:
-        """Write the tests of this process."""
-        worker = os.environ.get("PYTEST_XDIST_WORKER", "main")
-        kept = {name: entry for name, entry in self.tests.items() if entry["passed"] and "lines" in entry}
-        (self.target / f"map-{worker}.json").write_text(json.dumps(kept))
+        entry = self.tests.pop(nodeid, {"passed": False})
+        if entry["passed"]:
+            entry["lines"] = {path: sorted(lines) for path, lines in by_file.items()}
+            self.file.write(json.dumps({nodeid: entry}) + "\n")
 
 
 def pytest_configure(config: Any) -> None:
@@ -121,18 +120,20 @@ def environment_of(tree: Path) -> dict[str, str]:
     }
 
 
-def make_map(root: Path, work: Path, jobs: int, words: Sequence[str]) -> None:
-    """Run the tests once, and keep which of them run which line."""
+def make_map(root: Path, work: Path, jobs: int, limit_s: float | None, words: Sequence[str]) -> None:
+    """Run the tests once, and keep which of them run which line; a test that has not ended in time counts for none."""
     target = work / "map"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
     environment = os.environ | environment_of(root) | {"MUTANTS_MAP": str(target)}
     environment["PYTHONPATH"] += os.pathsep + str(Path(__file__).resolve().parent)
-    spread = ["-n", str(jobs), "--dist", "loadfile"] if jobs > 1 else []
+    spread = ["-n", str(jobs), "--dist", "loadfile", "--no-loadscope-reorder"] if jobs > 1 else []
     command = [sys.executable, "-m", "pytest", "-q", "-p", "line_map", "-p", "no:cacheprovider", *spread, *words]
-    subprocess.run(command, cwd=root, env=environment, check=False)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        subprocess.run(command, cwd=root, env=environment, check=False, timeout=limit_s)
     tests: dict[str, Any] = {}
-    for path in target.glob("map-*.json"):
-        tests |= json.loads(path.read_text())
+    for path in target.glob("map-*.jsonl"):
+        for line in path.read_text().splitlines(keepends=True):
+            tests |= json.loads(line) if line.endswith("\n") else {}
     (work / "map.json").write_text(json.dumps(tests))
     print(f"{len(tests)} tests that pass, {sum(t['seconds'] for t in tests.values()):.0f} s of them")
