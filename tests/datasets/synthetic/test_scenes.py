@@ -17,7 +17,7 @@ from cgwm.datasets.synthetic.record import Set, build_set, frame_of
 from cgwm.datasets.synthetic.sensor import READ_NOISE, SHOT_NOISE, expose
 from cgwm.schemas import CaptureManifest, UsageError, read_toml
 
-SMALL = {"photo_size": (160, 120), "video_size": (96, 72), "photos": 4}
+SMALL = {"photo_size": (96, 72), "video_size": (48, 36), "photos": 4}
 
 
 @cache
@@ -160,10 +160,10 @@ def test_capture_opens_and_manifest_validates(name: str, request: pytest.Fixture
     assert capture.manifest == read_toml(path / "capture.toml", CaptureManifest)
     assert capture.episodes("train") == ["000"]
     assert capture.episodes("test") == ["001", "002", "003"]
-    assert len(capture.photos()) == 4 and capture.photo("000.jpg").shape == (120, 160, 3)
+    assert len(capture.photos()) == 4 and capture.photo("000.jpg").shape == (72, 96, 3)
     assert all(body.shape is None for body in capture.manifest.bodies if body.motion == "free")
     for camera in ("left", "right"):
-        assert capture.video_frames(camera, "000").shape == (15, 72, 96, 3)
+        assert capture.video_frames(camera, "000").shape == (15, 36, 48, 3)
     assert [body.name for body in capture.manifest.bodies if body.motion == "driven"] == ["fingertip"] * (
         name == "push"
     )

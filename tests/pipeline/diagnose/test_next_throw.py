@@ -342,7 +342,7 @@ def test_a_law_found_is_saved_and_fitted(tmp_path: Path) -> None:
             "--set",
             "phys-geo.generations=2",
             "--set",
-            "phys-geo.step_s=0.002",
+            "phys-geo.step_s=0.003",
         ],
     )
     assert done.exit_code == 0, done.output
@@ -392,7 +392,7 @@ def test_an_effect_of_ones_own_is_tested_like_a_built_in_one(tmp_path: Path) -> 
     truth = world_with("ball")
     truth = replace(truth, effects=(ActiveEffect.of(load_effect(spec), {"w": 4.0}),))
     root = tmp_path / "capture"
-    model = write_capture(root, truth, tosses(truth, 3, 6, 0.4, height_m=(1.2, 1.6)), test=1)
+    model = write_capture(root, truth, tosses(truth, 3, 5, 0.4, 60.0, height_m=(1.2, 1.6)), test=1)
     with_it = diagnose(model, root, candidates=[spec])
     assert with_it.selected == (spec,) and with_it.verdict == "missing_effect"
     best = with_it.ranking[0]

@@ -46,8 +46,7 @@ def known(capture: Path) -> list[PoseTrack]:
     return []
 
 
-@pytest.fixture
-def tracked_once(known: list[PoseTrack], monkeypatch: pytest.MonkeyPatch) -> None:
+def track_once(known: list[PoseTrack], patch: pytest.MonkeyPatch) -> None:
     """Let a tracker give what another found in the same videos: looking for poses takes long."""
     run = PoseTracker.run
 
@@ -56,7 +55,7 @@ def tracked_once(known: list[PoseTrack], monkeypatch: pytest.MonkeyPatch) -> Non
             known.append(run(self))
         return known[0]
 
-    monkeypatch.setattr(PoseTracker, "run", found)
+    patch.setattr(PoseTracker, "run", found)
 
 
 def fitted(capture: Path, out: Path, config: PhysConfig = CONFIG, resume: bool = False) -> dict[str, bytes]:
@@ -64,11 +63,24 @@ def fitted(capture: Path, out: Path, config: PhysConfig = CONFIG, resume: bool =
     return contents(out)
 
 
-def test_spheres_that_touch_are_moved_where_that_is_wanted(capture: Path, tmp_path: Path, tracked_once: None) -> None:
+@pytest.fixture(scope="module")
+def plain(capture: Path, known: list[PoseTrack], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The fit with the settings of these tests."""
+    out = tmp_path_factory.mktemp("plain") / "model"
+    with pytest.MonkeyPatch.context() as patch:
+        search_briefly(patch)
+        track_once(known, patch)
+        fitted(capture, out)
+    return out
+
+
+def test_spheres_that_touch_are_moved_where_that_is_wanted(
+    capture: Path, plain: Path, known: list[PoseTrack], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    track_once(known, monkeypatch)
     before = (model_of(capture) / "cube.collision.ply").read_bytes()
-    still = fitted(capture, tmp_path / "still")
-    assert still["cube.collision.ply"] == before
-    assert read_model(tmp_path / "still").fit.stages["phys-geo"]["geometry"] == {}
+    assert contents(plain)["cube.collision.ply"] == before
+    assert read_model(plain).fit.stages["phys-geo"]["geometry"] == {}
     moved = fitted(capture, tmp_path / "moved", CONFIG.model_copy(update={"geometry": True}))
     assert moved["cube.collision.ply"] != before
     record = read_model(tmp_path / "moved").fit.stages["phys-geo"]["geometry"]["cube"]
@@ -80,9 +92,10 @@ def test_spheres_that_touch_are_moved_where_that_is_wanted(capture: Path, tmp_pa
 
 
 def test_an_interrupted_fit_does_not_look_for_poses_again(
-    capture: Path, tmp_path: Path, tracked_once: None, monkeypatch: pytest.MonkeyPatch
+    capture: Path, plain: Path, known: list[PoseTrack], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = fitted(capture, tmp_path / "whole")
+    track_once(known, monkeypatch)
+    whole = contents(plain)
     out = tmp_path / "model"
 
     def interrupted(*_: object) -> None:
