@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -215,9 +216,14 @@ def _supported(mapped: Mapped, start: str, inputs: Inputs, seed: int) -> tuple[M
 
 
 def _uncertain(mapped: Mapped, camera_model: str, inputs: Inputs) -> bool:
-    """Return whether the centres are so uncertain that finer places of the points are worth their time."""
+    """Return whether the centres are so uncertain that finer places of the points are worth their time.
+
+    A photo that is alone with its camera is as uncertain as its principal point, whatever its places.
+    """
     model = mapped.model()
-    return max(center_stds(model, estimated(camera_model, model, inputs)).values()) > _ALIGN_ABOVE
+    photos = Counter(model.image_camera.values())
+    stds = center_stds(model, estimated(camera_model, model, inputs))
+    return any(std > _ALIGN_ABOVE for image, std in stds.items() if photos[model.image_camera[image]] > 1)
 
 
 def _aligned(

@@ -17,7 +17,7 @@ from .reconstruction import Array
 LADDER = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 """COLMAP's camera models, from simple to rich: each holds those before it."""
 LENS_PARAMETERS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 6}
-"""Free numbers of a camera: focal lengths and lens; the principal point stays in the middle."""
+"""Free numbers of a camera: focal lengths and lens; the principal point comes last (`pose_posterior`)."""
 FIRST_TRIED = ("SIMPLE_RADIAL", "SIMPLE_PINHOLE", "OPENCV")
 """Camera models of the mapping, in this order until all images are registered."""
 LEAST_GAIN = 0.01
