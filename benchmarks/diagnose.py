@@ -68,6 +68,8 @@ FAMILIES: tuple[set[str], ...] = (
 """Effects that do much the same: to name one for another is a smaller fault."""
 LISTS = ("all", "rough", "odd", "drake", "video", "real-like")
 RIGHT = ("exact", "class", "exact, and more", "class, and more")
+SILENT = ("none_missing", "law_inexact")
+"""Verdicts that name no effect and find nothing left in flight."""
 COLUMNS = (*RIGHT, "among", "family", "wrong", "unexplained", "silent", "refused")
 """among: said to be not separable from others of contact, which is honest, and not right; family: one of them alone."""
 
@@ -81,8 +83,8 @@ def judged(case: Case, truth: dict[str, Any], found: dict[str, Any]) -> str:
         # what the engine's own law brings along is there, though nothing was hidden
         brought = set(truth["engine"].get("comes_with", ()))
         named = verdict == "missing_effect" and set(found["selected"]) <= brought
-        return "right" if verdict == "none_missing" or named else "false alarm"
-    if verdict == "none_missing":
+        return "right" if verdict in SILENT or named else "false alarm"
+    if verdict in SILENT:
         return "silent"
     if all(EFFECTS[name].acts == "unknown" for name in case.effects):
         return "exact" if verdict == "unexplained" else "class" if found["remaining_unexplained"] else "wrong"

@@ -8,9 +8,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from .base import FileModel
+from .compare import Phase
 from .described import NotDescribed
 
-Verdict = Literal["missing_effect", "none_missing", "not_separable", "unexplained", "not_described"]
+Verdict = Literal["missing_effect", "none_missing", "not_separable", "unexplained", "law_inexact", "not_described"]
 
 
 class EffectParameterEstimate(FileModel):
@@ -194,6 +195,21 @@ class LawTerm(FileModel):
     unit: str
 
 
+class PhaseMisfit(FileModel):
+    """How the law of contact describes one phase, beside the selected effects: medians over its short segments."""
+
+    phase: Phase
+    segments: int
+    segment_s: float
+    """Length of a segment, whose start is fitted to it [s]."""
+    reduced_chi2: float
+    """Mean square error in units of the noise: 1 where the law is exact."""
+    position_rms_m: float
+    rotation_rms_rad: float | None
+    then: str
+    """What to record and check next where the phase is badly described."""
+
+
 class ResidualLaw(FileModel):
     """The law that the residual wrench follows, where none of the candidates explains it."""
 
@@ -247,10 +263,14 @@ class DiagnoseResult(FileModel):
     flight_after: FlightTest | None = None
     contact_chi2: float | None = None
     """Mean chi2 of short contact segments: what the contact law cannot do counts in it."""
+    contact_misfits: tuple[PhaseMisfit, ...] = ()
+    """How the law of contact describes each phase, the worst first; none where an effect of contact is selected."""
     contact_limits: tuple[ContactLimit, ...] = ()
     """What contact could have shown, where it shows nothing: a verdict says nothing about smaller effects."""
     not_tested: dict[str, str] = {}
     """Candidates that these data cannot judge, and why."""
+    left_out_s: dict[str, tuple[float, ...]] = {}
+    """Times [s] of the frames of flight that were left out as wrong measurements, by episode."""
     warnings: tuple[str, ...] = ()
 
     def equals_of(self, name: str) -> tuple[str, ...]:

@@ -41,8 +41,10 @@ GRAVITY_M_S2 = 9.81
 
 _HALF_WINDOW_S, _TOLERANCE_M_S2 = 0.05, 2.0
 """Half width of the window of a quadratic fit whose acceleration distinguishes flight from other motion."""
-_LEAVES_M, _MARGIN = 0.0015, 5
-"""Deviation of the measurement from the fit that ends flight (the noise is 0.4 mm), and samples removed before it."""
+_WINDOW_STEPS = 10
+"""Fewest samples of this window, which is longer where they come at a lower rate."""
+_LEAVES_M, _MARGIN_S = 0.0015, 0.0165
+"""Deviation of the measurement from the fit that ends flight (the noise is 0.4 mm), and time [s] removed before it."""
 _SHORTEST_S = 0.3
 _LONGEST_THROW_M = 50.0
 """Spread of positions above which a message names it: a wrong unit is likely."""
@@ -76,18 +78,15 @@ def import_jugglebot(
     """
     with new_directory(out, "capture", overwrite) as directory:
         sessions = _sessions(Path(source), only)
-        recordings, lost = [], []
+        recordings = []
         for path, session in zip(sessions, episode_names([path.stem for path in sessions]), strict=True):
             throws = _read_npz(path) if path.suffix == ".npz" else _read_json(path)
             for number, (time, position) in enumerate(throws):
                 where = f"{path}: throw {number}"
-                if (gaps := np.count_nonzero(~np.isfinite(position).all(1))) > 0:
-                    lost.append(f"{where}: {gaps} of {len(position)} samples have no position and are left out.")
                 recordings.append(_throw(where, f"{session}-{number:02d}", session, time, position))
         splits = drawn_splits(recordings, n_train, n_test, seed)
         ball = Body(name=BALL, shape=Shape(sphere=SphereShape(radius_m=RADIUS_M)))
-        result = write_recordings(directory, out, World(), (ball,), recordings, splits)
-        return result.model_copy(update={"warnings": (*result.warnings, *lost)})
+        return write_recordings(directory, out, World(), (ball,), recordings, splits)
 
 
 def flight(time: Array, position: Array) -> tuple[int, int]:
@@ -101,7 +100,8 @@ def flight(time: Array, position: Array) -> tuple[int, int]:
         ValueError: If the flight around the highest point takes less than 0.3 s.
     """
     first, last = _extended_by_fit(time, position, *_around_top(time, position))
-    first, last = first + _MARGIN, last - _MARGIN
+    margin = max(2, round(_MARGIN_S / float(np.median(np.diff(time)))))
+    first, last = first + margin, last - margin
     if last <= first or time[last] - time[first] < _SHORTEST_S:
         raise ValueError(f"the flight takes less than {_SHORTEST_S:g} s")
     return first, last
@@ -124,8 +124,9 @@ def _around_top(time: Array, position: Array) -> tuple[int, int]:
 
 def _falls_freely(time: Array, position: Array, k: int) -> bool:
     """Return whether the acceleration near sample k is that of gravity."""
-    near = np.abs(time - time[k]) < _HALF_WINDOW_S
-    if np.count_nonzero(near) < 10:
+    half_s = max(_HALF_WINDOW_S, (_WINDOW_STEPS + 1) / 2 * float(np.median(np.diff(time))))
+    near = np.abs(time - time[k]) < half_s
+    if np.count_nonzero(near) < _WINDOW_STEPS:
         return False
     acceleration = 2 * np.polyfit(time[near] - time[k], position[near], 2)[0]
     return float(np.hypot(np.hypot(*acceleration[:2]), acceleration[2] + GRAVITY_M_S2)) < _TOLERANCE_M_S2

@@ -36,6 +36,8 @@ FASTEST_RAD_S = 5000.0
 """Largest angular velocity [rad/s]: 50 000 turns a minute; larger ones are in degrees."""
 _LONGEST_NAME = 150
 """Maximum length of the name of an episode, which becomes that of a file."""
+_GAP_STEPS, _GAPS_NAMED = 1.75, 3
+"""Time step, in usual ones, that is a gap; and maximum number of tracks with gaps that are named."""
 _TRAIN_SHARE = 0.6
 """Default share of the episodes in the split "train"."""
 
@@ -313,7 +315,39 @@ def write_recordings(
         episodes=len(recordings),
         samples=sum(len(track) for recording in recordings for track in recording.tracks.values()),
         splits={name: len(episodes) for name, episodes in splits.items()},
+        warnings=gap_warnings(recordings),
     )
+
+
+def gap_warnings(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Return a warning that names the recordings whose times have gaps, with the samples that are missing in each.
+
+    Samples without a pose leave gaps, and so do frames that a camera dropped.
+    """
+    found = []
+    for recording in recordings:
+        for body, track in recording.tracks.items():
+            steps = np.diff(track.time_s)
+            usual = float(np.median(steps)) if len(steps) else 0.0
+            gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
+            if not len(gaps):
+                continue
+            missing = int(np.rint(steps[gaps] / usual).sum()) - len(gaps)
+            k = gaps[np.argmax(steps[gaps])]
+            name = recording.name if len(recording.tracks) == 1 else f"{recording.name} ({body})"
+            where = f"the longest of {1e3 * steps[k]:.3g} ms at {track.time_s[k]:.3f} s"
+            found.append(
+                (missing, f"{name} lacks {missing} of {missing + len(track)} samples in {_count(len(gaps))}, {where}")
+            )
+    if not found:
+        return ()
+    worst = [words for _, words in sorted(found, key=lambda one: -one[0])[:_GAPS_NAMED]]
+    more = f"; {len(found) - len(worst)} further tracks have gaps, too" if len(found) > len(worst) else ""
+    return (f"samples are missing: {'; '.join(worst)}{more}. Gaps are allowed: nothing is filled in.",)
+
+
+def _count(gaps: int) -> str:
+    return "1 gap" if gaps == 1 else f"{gaps} gaps"
 
 
 def upright(up: Literal["z", "y"]) -> World:

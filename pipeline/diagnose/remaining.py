@@ -1,20 +1,42 @@
-"""What the selected effects leave in flight, and what they gain in held-out episodes, as the result states them."""
+"""What the selected effects leave in flight and in contact, and what they gain in held-out episodes.
+
+No candidate stands for the law of contact: where impacts or slides are off by many times the noise and no effect
+explains it, that nothing is missing would be wrong. A phase counts as badly described where most of its segments are,
+not where one impact is.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypedDict
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from ...schemas import Remaining
+from ...schemas import PhaseMisfit, Remaining
 from ..optimization.uncertainty import student_quantile
+from ..segments.contact_phases import PHASES, PhaseName, contact_phases
 from ..segments.prepare import whole_flights
 from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
 from ..trajectories.innovations import WHITE
 from .evidence import Evidence
 from .flight_findings import FlightFindings
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.verdict
+
+NEXT: dict[PhaseName, str] = {
+    "impact": "drop the body without spin onto one face at several speeds, and check its shape and the frame rate",
+    "sliding": "record slides in several directions on the same ground, and check the shape and the ground's height",
+    "rolling": "roll the body slowly in several directions, and check its radius and whether the ground is level",
+    "sticking": "tip the body over its edges slowly, and check its shape and centre of mass",
+    "rest": "record the body at rest on each face, and check the ground's height, its tilt, and how the markers sit",
+}
+"""What to record and check next where a phase is badly described."""
 
 
 class HeldOut(TypedDict):
@@ -78,3 +100,58 @@ def _residuals(segments: Segments) -> tuple[float, float | None]:
         count = float(mask.sum())
         found.append(std * math.sqrt(float(part.square().sum()) / count) if count else None)
     return found[0] or 0.0, found[1]
+
+
+def misfits_of(contact: Segments) -> list[PhaseMisfit]:
+    """Return how each phase of contact is described, the worst first, from segments with fitted states."""
+    none = contact.world.gravity.new_zeros(0)
+    chi2 = contact.residuals([], none, jacobian=False)[0].square().flatten(1).sum(1) / contact.dof.clamp_min(1.0)
+    plain = replace(contact, noise_model=WHITE).residuals([], none, jacobian=False)[0]
+    causes = [_cause(phases) for phases in contact_phases(contact)]
+    found = []
+    for phase in PHASES[1:]:
+        own = [k for k, cause in enumerate(causes) if cause == phase]
+        if own:
+            found.append(_misfit(phase, contact.select(own), chi2[own], plain[own]))
+    return sorted(found, key=lambda one: -one.reduced_chi2)
+
+
+def bad_ones(misfits: Sequence[PhaseMisfit]) -> list[PhaseMisfit]:
+    """Return the phases that the law of contact does not describe, the worst first."""
+    least, most = LIMITS.misfit_segments, LIMITS.misfit_chi2
+    return [one for one in misfits if one.segments >= least and one.reduced_chi2 > most]
+
+
+def _cause(phases: Sequence[PhaseName]) -> PhaseName:
+    """Return the phase that a segment's errors count for: an impact if it has one, else its most frequent contact."""
+    touching: list[PhaseName] = [phase for phase in phases if phase != "flight"]
+    if "impact" in touching or not touching:
+        return "impact" if touching else "flight"
+    return max(PHASES[1:], key=touching.count)
+
+
+def _misfit(phase: PhaseName, segments: Segments, chi2: Tensor, rows: Tensor) -> PhaseMisfit:
+    """Return how a phase is described.
+
+    Args:
+        phase: The phase.
+        segments: Its segments (B).
+        chi2: Their chi2 per degree of freedom, shape (B,).
+        rows: Their residuals in units of white noise, shape (B, F, 6).
+    """
+    seen = segments.observations
+    sizes = []
+    for part, mask, std in zip(rows.split(3, 2), (seen.seen, seen.has_orientation), segments.noise, strict=True):
+        square, count = part.square().flatten(1).sum(1), mask.flatten(1).sum(1)
+        known = count > 0
+        sizes.append(std * math.sqrt(float((square[known] / count[known]).median())) if bool(known.any()) else None)
+    length = [float(seen.times_s[k, n - 1] - seen.times_s[k, 0]) for k, n in enumerate(segments.lengths)]
+    return PhaseMisfit(
+        phase=phase,
+        segments=len(segments.items),
+        segment_s=float(np.median(length)),
+        reduced_chi2=float(torch.nan_to_num(chi2, nan=math.inf).median()),
+        position_rms_m=sizes[0] or 0.0,
+        rotation_rms_rad=sizes[1],
+        then=NEXT[phase],
+    )

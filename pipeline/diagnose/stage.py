@@ -60,7 +60,15 @@ from .sparse_regression import residual_law
 from .thresholds import THRESHOLDS
 from .unlike_episodes import unlike_episodes, unlike_warnings
 from .verdict import Findings, find
-from .wording import law_warnings, motion_warnings, noisy_warnings, sentence, size_warnings, unseen_motion
+from .wording import (
+    law_warnings,
+    misfit_warnings,
+    motion_warnings,
+    noisy_warnings,
+    sentence,
+    size_warnings,
+    unseen_motion,
+)
 
 JOINTED = (
     "of the jointed body '{name}' the motion of the centre of mass of its links was examined, in flight alone: what "
@@ -205,7 +213,7 @@ def report_and_findings(
     clear = prepared.airborne & (prepared.observations.seen.amax(-1) > 0)
     seen = int((prepared.observations.seen.amax(-1) > 0).sum())
     warnings = [*prepared.warnings, *motion_warnings(prepared), *noisy_warnings(prepared, findings)]
-    warnings += [*law_warnings(findings), *size_warnings(findings)]
+    warnings += [*law_warnings(findings), *size_warnings(findings), *misfit_warnings(findings)]
     law = _law(findings.flight.prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
@@ -227,8 +235,10 @@ def report_and_findings(
         flight_before=_flight_test(findings.flight.before),
         flight_after=_flight_test(findings.flight.after),
         contact_chi2=findings.contact_chi2,
+        contact_misfits=findings.misfits,
         contact_limits=tuple(_limit(one) for one in findings.limits),
         not_tested=_not_tested(refused, findings),
+        left_out_s=dict(prepared.left_out_s),
         warnings=tuple(warnings),
     )
     return document, findings

@@ -134,6 +134,14 @@ class VerdictThresholds:
         (0, 1000),
     )
     omnibus_p: float = threshold(1e-4, "probability", "see `omnibus_limit`", BY_ARGUMENT, "see `omnibus_limit`")
+    misfit_chi2: float = threshold(
+        9.0,
+        "chi2 / dof",
+        "a phase of contact is badly described, so that no verdict says that nothing is missing, where half of its "
+        "segments are above it",
+        "by argument: an error of three standard deviations of the noise is seen by eye in a plot",
+    )
+    misfit_segments: int = threshold(4, "segments", "fewest segments of such a phase", BY_ARGUMENT)
     omnibus_s: tuple[float, ...] = threshold(
         (0.3, 0.15), "s", "lengths of the pieces of flight for that test: slow forces and short ones"
     )

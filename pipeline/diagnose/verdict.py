@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from ...datasets.io.progress import note
+from ...schemas import PhaseMisfit
 from ..physics.world import World
 from ..segments.candidates import Candidate, without_effect
 from ..segments.prepare import Prepared
@@ -20,11 +21,12 @@ from .effect_selection import SelectionStep
 from .evidence import Evidence
 from .flight_findings import FlightFindings, flight_findings
 from .flight_omnibus import is_significant
+from .remaining import bad_ones, misfits_of
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
 
-VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable"]
+VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable", "law_inexact"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +60,9 @@ class Findings:
     sliding: StartedSliding | None = None
     """The sliding segments and their fit without effects of contact; None without any."""
 
+    misfits: tuple[PhaseMisfit, ...] = ()
+    """How the law of contact describes each phase, the worst first; none where contact selected an effect."""
+
     @property
     def judged_in_contact(self) -> set[str]:
         """Names of the effects whose evidence comes from contact."""
@@ -85,7 +90,11 @@ def find(
     errors = _errors(contact, flown)
     if flown.remains or flown.own:  # what flights show may be what contact imitates
         contact = _without_useless(contact)
+    in_contact = any(one.where == "contact" for one in contact.chosen)
+    misfits = () if contact.segments is None or in_contact else misfits_of(contact.segments)
     verdict = _verdict(contact.chosen, flown)
+    if verdict == "none_missing" and bad_ones(misfits):
+        verdict = "law_inexact"
     return Findings(
         verdict=verdict,
         chosen=tuple(contact.chosen),
@@ -100,6 +109,7 @@ def find(
         as_good=tuple(one for one in flown.others if one.as_good),
         limits=contact.limits,
         sliding=contact.sliding,
+        misfits=tuple(misfits),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ...schemas import ResidualLaw
 from ..physics.effects.effect import EffectParameter
 from ..report.page import listed
@@ -9,9 +11,12 @@ from ..segments.prepare import Prepared
 from .evidence import Evidence, implausible
 from .law_export import further_terms
 from .own_accelerations import UPWARD
+from .remaining import bad_ones
 from .verdict import Findings
 
 _DIFFERS = " Something is left in flight; it differs from episode to episode, as errors of the tracking do."
+_INEXACT = "the law of contact does not describe all of the motion"
+_PHASE_WORDS = {"impact": "impacts", "sliding": "slides", "rolling": "rolling", "sticking": "tipping", "rest": "rest"}
 _ORGANISED = {
     "constant": "In these flights, one constant force explains more than any coordinate does.",
     "time": "The force changes most clearly with the time within an episode.",
@@ -40,6 +45,8 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
     names = [c.evidence.candidate.spec for c in findings.chosen]
     if findings.verdict == "none_missing":
         return f"Nothing is missing that these data could show.{_DIFFERS if findings.remaining else ''}"
+    if findings.verdict == "law_inexact":
+        return f"No effect is named, but {_INEXACT}: {_misfit(findings)}{_described(findings)}"
     if findings.verdict == "unexplained":
         where = f" {organised(law.where)}" if law is not None else ""
         return f"Something is missing in flight, and none of the candidates explains it.{where}{_own(findings)}"
@@ -49,6 +56,25 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
     named = listed([word or name for word, name in zip(words, names, strict=True)])
     return f"Missing: {named}.{_apart(findings)}{_rest(findings, law)}"
+
+
+def _misfit(findings: Findings) -> str:
+    """Return which phases of contact are badly described, how badly, and what to record next for the worst."""
+    bad = bad_ones(findings.misfits)
+    words = []
+    for one in bad:
+        turned = "" if one.rotation_rms_rad is None else f" and {math.degrees(one.rotation_rms_rad):.2g} deg"
+        size = f"{1e3 * one.position_rms_m:.2g} mm{turned} within {1e3 * one.segment_s:.0f} ms"
+        times = f"{math.sqrt(one.reduced_chi2):.0f} times the noise"
+        words.append(f"in {_PHASE_WORDS[one.phase]} it is off by {size} ({times})")
+    return f"{listed(words)}, and none of the candidates explains it. Next, {bad[0].then}."
+
+
+def _described(findings: Findings) -> str:
+    """Return what is described down to the noise all the same; empty where nothing is."""
+    if findings.flight.before is None or findings.remaining:
+        return _DIFFERS if findings.remaining else ""
+    return " In flight nothing is missing that these data could show."
 
 
 def _own(findings: Findings) -> str:
@@ -180,6 +206,13 @@ def _sizes(evidence: Evidence) -> str:
 def _unit(parameter: EffectParameter) -> str:
     """Return the unit of a parameter as it follows a number; empty for none."""
     return "" if parameter.unit == "1" else f" {parameter.unit}"
+
+
+def misfit_warnings(findings: Findings) -> list[str]:
+    """Return a warning where the law of contact does not describe a phase and the verdict is about another thing."""
+    if findings.verdict == "law_inexact" or not bad_ones(findings.misfits):
+        return []
+    return [f"{_INEXACT}: {_misfit(findings)}"]
 
 
 def law_warnings(findings: Findings) -> list[str]:

@@ -28,6 +28,8 @@ from .segments import Kind, Segments
 from .thresholds import SEGMENT_THRESHOLDS
 
 LIMITS = SEGMENT_THRESHOLDS.preparation
+NAMED = 3
+"""Maximum number of episodes, and of times of each, that a warning names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +56,7 @@ class Prepared:
     contact_items: tuple[Segment, ...]
     """The contact segments."""
     outliers: int
-    """Number of frames left out as wrong measurements."""
+    """Number of measurements of positions and turns that are left out as wrong."""
     has_orientation: bool
     """Whether orientations were measured."""
     warnings: tuple[str, ...]
@@ -64,6 +66,8 @@ class Prepared:
     measured."""
     noise_model: NoiseModel = WHITE
     """Correlation of the errors in time."""
+    left_out_s: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """Times [s] of the frames of flight that are left out as wrong measurements, by name of the episode."""
 
     @property
     def least_force_m_s2(self) -> float:
@@ -148,6 +152,7 @@ def prepare(
         _remove_outliers(state)
         _remove_held_starts(state)
         _model_correlated_noise(state)
+    left_out = _left_out(state, world, episodes)
     turned = state.oriented
     if _touches_nothing(world):
         state.contact = []  # what does not fly is in a hand or was caught: it says nothing of a law of contact
@@ -168,9 +173,10 @@ def prepare(
         contact_items=tuple(state.contact),
         outliers=state.outliers,
         has_orientation=turned,
-        warnings=(*state.warnings, *release_warnings(released, starts)),
+        warnings=(*_outlier_warnings(state.outliers, left_out), *state.warnings, *release_warnings(released, starts)),
         released_s=released,
         noise_model=state.noise_model,
+        left_out_s=left_out,
     )
 
 
@@ -308,8 +314,33 @@ def _remove_held_starts(state: _State) -> None:
         state.outliers, state.touched = state.outliers + more, state.touched | again
         state.segment(state.touched)
         state.fit_flights()
-    if state.outliers:
-        state.warnings.append(f"{state.outliers} frames of flight are wrong measurements and were left out.")
+
+
+def _left_out(state: _State, world: World, episodes: Sequence[Episode]) -> dict[str, tuple[float, ...]]:
+    """Return the times [s] of frames of which a position or turn is left out as wrong, by name of the episode."""
+    if not state.outliers:
+        return {}
+    before, after = without_held(whole_episodes(world, episodes), state.held), state.observations
+    pairs = ((before.seen, after.seen), (before.has_orientation, after.has_orientation))
+    lost = torch.stack([((old > 0) & (new <= 0)).any(-1) for old, new in pairs]).any(0)
+    times = {name: tuple(after.times_s[k, lost[k]].tolist()) for k, (name, _) in enumerate(episodes)}
+    return {name: found for name, found in times.items() if found}
+
+
+def _outlier_warnings(count: int, left_out_s: Mapping[str, tuple[float, ...]]) -> list[str]:
+    """Return a warning that says which measurements were left out: the episodes with the most, and their times."""
+    if not count:
+        return []
+    most = sorted(left_out_s, key=lambda name: (-len(left_out_s[name]), name))
+    shown = [_times_words(name, left_out_s[name]) for name in most[:NAMED]]
+    more = f"; and {len(most) - NAMED} more episodes" if len(most) > NAMED else ""
+    return [f"{count} measurements in flight are wrong and were left out: {'; '.join(shown)}{more}."]
+
+
+def _times_words(name: str, times_s: Sequence[float]) -> str:
+    """Return an episode's times in words, without all of many."""
+    shown = ", ".join(f"{time:.3f}" for time in times_s[:NAMED])
+    return f"{name} at {shown} s" + (f" and {len(times_s) - NAMED} more" if len(times_s) > NAMED else "")
 
 
 def _model_correlated_noise(state: _State) -> None:

@@ -85,6 +85,7 @@ NUMERICS = {
 }
 """Numbers of modules in `pipeline/diagnose` outside of the table, each with the reason why it decides no verdict."""
 SEGMENT_NUMERICS = {
+    "length of a warning": ("prepare.NAMED",),
     "end of a descent": (
         "first_contact_fit.ITERATIONS",
         "impact_fit.ITERATIONS, FALL",

@@ -360,10 +360,13 @@ def thrown(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return time, position + 4e-4 * np.random.default_rng(seed).standard_normal((600, 3))
 
 
-def test_the_flight_of_a_throw_is_found() -> None:
-    time, position = thrown()
+@pytest.mark.parametrize("every", [1, 2, 3, 5])
+def test_the_flight_of_a_throw_is_found_at_any_rate(every: int) -> None:
+    time, position = (values[::every] for values in thrown())
     first, last = flight(time, position)
-    assert 0.5 <= time[first] < 0.54 and 1.35 < time[last] < 1.4
+    assert 0.5 <= time[first] < 0.55 and 1.33 < time[last] < 1.4
+    if every > 1:
+        return
     with pytest.raises(ValueError, match="nothing flies"):
         flight(time[:120], position[:120])
 
@@ -383,6 +386,7 @@ def test_jugglebot_from_both_files(tmp_path: Path) -> None:
     (tmp_path / "in" / "b.json").write_text(json.dumps({"Timebase": {"Frequency": 300.0}, "Markers": markers}))
     result = import_jugglebot(tmp_path / "in", tmp_path / "out")
     assert (result.episodes, result.splits) == (6, {"train": 4, "test": 2})
+    assert len(result.warnings) == 1 and "b-00 lacks 10 of" in result.warnings[0]
     capture = Capture.open(tmp_path / "out")
     check_capture(capture)
     assert {entry.group for entry in capture.manifest.episodes.values()} == {"a", "b"}
