@@ -149,21 +149,33 @@ class Segments:
         parts = []
         for places in self.chunks((1 + (self.kind == "contact")) * size + len(parameters) + 1 if jacobian else 1):
             some = self.observations.select(places)
-            problem = TrajectoryResiduals(
-                self.world,
-                parameters,
-                some,
-                *self.noise,
-                differences=True,
-                smooth=self.kind == "flight",
-                parameter_steps=steps,
-            )
+            problem = replace(self._problem(parameters, some), parameter_steps=steps)
             shared = values if values.ndim == 1 else values[places]
             rows, slopes = problem(shared, torch.zeros(len(places), size).to(self.world.gravity), jacobian)
             fresh = None if slopes is None else _innovations(some, slopes, self.noise_model)
             parts.append((_innovations(some, rows, self.noise_model), fresh))
         rows = torch.cat([r for r, _ in parts])
         return rows, torch.cat([j for _, j in parts if j is not None]) if jacobian else None
+
+    def _problem(self, parameters: Sequence[Parameter], seen: Observations) -> TrajectoryResiduals:
+        """Return the residuals of some of the segments."""
+        smooth = self.kind == "flight"
+        return TrajectoryResiduals(self.world, parameters, seen, *self.noise, differences=True, smooth=smooth)
+
+    def varied(self, parameters: Sequence[Parameter], values: Tensor, changes: Tensor) -> Tensor:
+        """Return residuals (K, B, T nf, 6), as `residuals` does, of K variations of each segment.
+
+        Args:
+            parameters: Parameters of the world (P).
+            values: Their values in fitted coordinates, shape (K, B, P).
+            changes: Changes of the states, shape (K, B, S).
+        """
+        parts = []
+        for places in self.chunks(len(values)):
+            some = self.observations.select(places)
+            rows = self._problem(parameters, some).varied(values[:, places], changes[:, places])
+            parts.append(_innovations(some, rows.movedim(0, -1), self.noise_model).movedim(-1, 0))
+        return torch.cat(parts, 1)
 
     def innovations(self, rows: Tensor) -> Tensor:
         """Return rows (B, T nf, 6, ...) as innovations: less what the correlated errors of earlier frames predict."""

@@ -17,7 +17,7 @@ from ..physics.parameters import Parameter
 from ..physics.world import State
 from ..trajectories.residuals import retract
 from .segments import Segments
-from .sliding_residuals import chi2_by_segment, finite_differences
+from .sliding_residuals import LoadErrors, chi2_by_segment, finite_differences
 
 WEAK = 1e-9
 """Information added to each direction of a state, in difference steps: directions that nothing measured stay solvable.
@@ -114,6 +114,7 @@ class _SlidingProblem(Problem):
         centre: Tensor | None,
     ) -> None:
         self.segments, self.parameters, self.values, self.free, self.owner = segments, parameters, values, free, group
+        self.loads = LoadErrors.of(segments)
         self.place = free.clamp_min(0)
         self.basis: Tensor | None = None  # directions (B, 12, K) of the states at the last linearisation
         self.start = values.gather(1, self.place)
@@ -139,13 +140,13 @@ class _SlidingProblem(Problem):
     def costs(self, point: Point, rows: Rows) -> Tensor:
         """Return the chi2 (b,) of each segment."""
         segments, values = self._at(point, rows)
-        return chi2_by_segment(segments, self.parameters, values)
+        return chi2_by_segment(segments, self.parameters, values, self.loads.select(rows.items))
 
     def linearised(self, point: Point, rows: Rows) -> NormalEquations:
         """Return the normal equations by the free parameters and by changes of state along the ground."""
         segments, values = self._at(point, rows)
         free = self.free[rows.groups][rows.owner]
-        found = finite_differences(segments, self.parameters, values, free)
+        found = finite_differences(segments, self.parameters, values, free, self.loads.select(rows.items))
         basis = found.basis if self.basis is None else self.basis
         self.basis = basis.index_copy(0, rows.items, found.basis)
         return NormalEquations.of_rows(found.rows, found.jacobian, free.shape[1], found.chi2, prior=WEAK)

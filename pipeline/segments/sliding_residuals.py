@@ -49,42 +49,65 @@ def soft_world(world: World) -> World:
     return replace(world, contact=soft, ground_offset=offset, step_s=0.5 * TIME_S, iterations=sweeps)
 
 
-def chi2_by_segment(segments: Segments, parameters: Sequence[Parameter], values: Tensor) -> Tensor:
-    """Return the chi2 (B,) of each segment; 1e12 where a rollout diverged."""
-    return _chi2(without_loads(segments, segments.residuals(parameters, values, jacobian=False)[0]))
-
-
-def _chi2(rows: Tensor) -> Tensor:
-    """Return the chi2 (B,) of residuals (B, T, 6); 1e12 where a rollout diverged."""
-    return torch.nan_to_num(rows.square().sum((1, 2)), nan=1e12, posinf=1e12)
-
-
-def without_loads(segments: Segments, rows: Tensor) -> Tensor:
-    """Return residuals (B, T, 6) in sigmas with the model error of the load distribution whitened.
+@dataclass(frozen=True)
+class LoadErrors:
+    """Model error of the load distribution in sliding segments (B), as directions of their R = 6 T residuals.
 
     Derived. With the columns of U the residuals of rotations about the normal by angular accelerations that are
     constant and that grow with time, whose standard deviation is s, the covariance of the residuals is 1 + s^2 U U^T;
     they are multiplied by its inverse root.
     """
-    seen, world = segments.observations, segments.world
-    body = world.bodies[seen.free[0]]
-    if is_round(body):
-        return rows
-    normal = GroundPlane.of(world).normal
-    turned = seen.has_orientation[:, :, 0, None] / segments.noise.rotation_rad
-    times = (seen.times_s - seen.times_s[:, :1])[..., None]
-    share = times / times.amax(1, keepdim=True).clamp_min(1e-9)
-    axis = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ normal
-    turn = 0.5 * times.square() * axis * turned
-    turns = torch.stack([torch.cat((torch.zeros_like(axis), one), -1) for one in (turn, share / 3 * turn)], -1)
-    reach = body.centers[0].norm(dim=-1).max()
-    torque = contact_law(world).friction[0] * world.gravity[0].norm() * body.mass[0] * reach
-    spread = LOADS_UNKNOWN * torque / body.inertia[0].diagonal().mean()
-    turns = segments.innovations(turns)
-    directions, sizes, _ = torch.linalg.svd(turns.flatten(1, 2), full_matrices=False)
-    known = 1 - (1 + (spread * sizes).square()).rsqrt()
-    along = directions.mT @ rows.flatten(1)[..., None]
-    return rows - (directions @ (known[..., None] * along)).view_as(rows)
+
+    directions: Tensor
+    """Orthonormal directions in the residuals of each segment, shape (B, R, 2); of a round body none, (B, R, 0)."""
+    known: Tensor
+    """Part of the residuals along each direction that the error makes worthless, shape (B, 2) or (B, 0)."""
+
+    @staticmethod
+    def of(segments: Segments) -> LoadErrors:
+        """Return what the loads of segments (B) may do to their residuals, whatever their states."""
+        seen, world = segments.observations, segments.world
+        body = world.bodies[seen.free[0]]
+        if is_round(body):
+            count, frames = seen.times_s.shape
+            none = seen.times_s.new_zeros(count, 6 * frames, 0)
+            return LoadErrors(none, none[:, 0])
+        normal = GroundPlane.of(world).normal
+        turned = seen.has_orientation[:, :, 0, None] / segments.noise.rotation_rad
+        times = (seen.times_s - seen.times_s[:, :1])[..., None]
+        share = times / times.amax(1, keepdim=True).clamp_min(1e-9)
+        axis = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ normal
+        turn = 0.5 * times.square() * axis * turned
+        turns = torch.stack([torch.cat((torch.zeros_like(axis), one), -1) for one in (turn, share / 3 * turn)], -1)
+        reach = body.centers[0].norm(dim=-1).max()
+        torque = contact_law(world).friction[0] * world.gravity[0].norm() * body.mass[0] * reach
+        spread = LOADS_UNKNOWN * torque / body.inertia[0].diagonal().mean()
+        turns = segments.innovations(turns)
+        directions, sizes, _ = torch.linalg.svd(turns.flatten(1, 2), full_matrices=False)
+        return LoadErrors(directions, 1 - (1 + (spread * sizes).square()).rsqrt())
+
+    def select(self, items: Tensor) -> LoadErrors:
+        """Return those of some segments (b,)."""
+        return LoadErrors(self.directions[items], self.known[items])
+
+    def whitened(self, rows: Tensor) -> Tensor:
+        """Return residuals (K, B, T, 6) in sigmas, K times those of each segment, with this error whitened."""
+        if not self.known.shape[1]:
+            return rows
+        every = rows.flatten(2).movedim(0, -1)  # (B, R, K)
+        along = self.known[..., None] * (self.directions.mT @ every)
+        return rows - (self.directions @ along).movedim(-1, 0).view_as(rows)
+
+
+def chi2_by_segment(segments: Segments, parameters: Sequence[Parameter], values: Tensor, loads: LoadErrors) -> Tensor:
+    """Return the chi2 (B,) of each segment; 1e12 where a rollout diverged."""
+    rows = segments.residuals(parameters, values, jacobian=False)[0]
+    return _chi2(loads.whitened(rows[None])[0])
+
+
+def _chi2(rows: Tensor) -> Tensor:
+    """Return the chi2 (B,) of residuals (B, T, 6); 1e12 where a rollout diverged."""
+    return torch.nan_to_num(rows.square().sum((1, 2)), nan=1e12, posinf=1e12)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +125,11 @@ class SlidingDifferences:
 
 
 def finite_differences(
-    segments: Segments, parameters: Sequence[Parameter], values: Tensor, free: Tensor
+    segments: Segments,
+    parameters: Sequence[Parameter],
+    values: Tensor,
+    free: Tensor,
+    loads: LoadErrors | None = None,
 ) -> SlidingDifferences:
     """Return residuals of sliding segments with their derivatives by parameters and states.
 
@@ -111,6 +138,7 @@ def finite_differences(
         parameters: Parameters of their world (P).
         values: Of each segment (B, P), in fitted coordinates.
         free: Indices (B, S) of the parameters by which the first S derivatives are; -1 for a derivative of 0.
+        loads: Model errors of the loads of the segments, where they are known.
     """
     basis = _basis(segments)
     k, (n, size) = basis.shape[-1], free.shape
@@ -123,12 +151,10 @@ def finite_differences(
         moves.append(values.scatter_add(1, at, steps[at] * (free[:, column, None] >= 0)))
     changes += [sign * basis[..., j] for j in range(k) for sign in (1.0, -1.0)]
     moves += [values] * (2 * k)
-    every = segments.select(list(range(n)) * len(changes)).moved(torch.cat(changes))
-    rows = every.residuals(parameters, torch.cat(moves), jacobian=False)[0]
-    rows = without_loads(every, rows)
-    chi2 = _chi2(rows[:n])
-    rows = rows.flatten(1).unflatten(0, (len(changes), n))
-    rows = torch.nan_to_num(rows, nan=0.0, posinf=0.0, neginf=0.0)
+    rows = segments.varied(parameters, torch.stack(moves), torch.stack(changes))
+    rows = (LoadErrors.of(segments) if loads is None else loads).whitened(rows)
+    chi2 = _chi2(rows[0])
+    rows = torch.nan_to_num(rows.flatten(2), nan=0.0, posinf=0.0, neginf=0.0)
     by_value = (rows[1 : 1 + size] - rows[0]).movedim(0, -1) / steps[free.clamp_min(0)][:, None]
     by_state = 0.5 * (rows[1 + size :: 2] - rows[2 + size :: 2]).movedim(0, -1)
     return SlidingDifferences(rows=rows[0], chi2=chi2, jacobian=torch.cat((by_value, by_state), -1), basis=basis)

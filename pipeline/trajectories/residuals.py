@@ -106,6 +106,13 @@ class TrajectoryResiduals:
         slopes = (high - low) / (down + up)[:, None, None]
         return rows[0], torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(0, -1)
 
+    def varied(self, values: Tensor, states: Tensor) -> Tensor:
+        """Return residuals (K, B, F, 6) of K variations of each item: values (K, B, P), changes of states (K, B, S)."""
+        inputs = torch.cat((values, states), -1)
+        with torch.no_grad():
+            rows = self._residuals(inputs.flatten(0, 1), len(inputs))
+        return rows.unflatten(0, (len(inputs), -1)).unflatten(-1, (-1, 6))
+
     def rollout(self, shared: Tensor, states: Tensor) -> Rollout:
         """Return the rollout of given parameters (P,) and state changes (B, S)."""
         with torch.no_grad():

@@ -22,7 +22,7 @@ from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.prepare import Prepared, prepare
 from cgwm.pipeline.segments.segments import Segments
 from cgwm.pipeline.segments.sliding_fit import StartedSliding
-from cgwm.pipeline.segments.sliding_residuals import soft_world, without_loads
+from cgwm.pipeline.segments.sliding_residuals import LoadErrors, soft_world
 from cgwm.pipeline.segments.sliding_segments import find_sliding_segments
 from cgwm.pipeline.trajectories.segmentation import Segment
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -301,11 +301,12 @@ def test_what_unknown_loads_turn_is_no_evidence() -> None:
     frames = [Segment(k, 0, 50) for k in range(2)]
     glides = Segments.of("contact", soft, prepared.observations, frames, prepared.noise)
     rows = glides.residuals([FRICTION], torch.zeros(2, 1, dtype=torch.float64), jacobian=False)[0]
-    weak, full = without_loads(glides, rows), rows
+    loads = LoadErrors.of(glides)
+    weak, full = loads.whitened(rows[None])[0], rows
     up = quat_to_matrix(glides.observations.quat_wxyz[:, :, 0]).transpose(-1, -2) @ soft.ground_normal
     squared = glides.observations.times_s[..., None].square()
     constant = torch.cat((torch.zeros_like(up), squared * up), -1)  # a turn at constant angular acceleration
     for given, least, most in ((constant, 0.0, 0.05), (rows.roll(1, -1), 0.5, 1.0)):
-        share = without_loads(glides, given).norm() / given.norm()
+        share = loads.whitened(given[None]).norm() / given.norm()
         assert least <= share <= most
     assert weak.norm() <= full.norm()
