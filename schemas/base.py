@@ -53,7 +53,7 @@ class FileModel(BaseModel):
     What is read (:func:`parse`) is taken by its type: `true` and `"-9.81"` are no numbers, and a number is no text.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True, defer_build=True)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: type[BaseModel], handler: GetCoreSchemaHandler) -> CoreSchema:

@@ -108,10 +108,13 @@ def continuous_turns(
     base = quat_wxyz.gather(-2, reference[..., None, None].expand(*reference.shape, 1, 4))
     since = times_s - times_s.gather(-1, reference[..., None])
     turned = quat_multiply(quat_conjugate(base), quat_wxyz)
+    plain = quat_log(turned)
+    far = (speed * since.abs() * known).amax(-1) > torch.pi
+    if not bool(far.any()):
+        return plain
     even = spin[..., None, :] * since[..., None]
     left = even + quat_log(quat_multiply(quat_exp(-even), turned))
-    far = (speed * since.abs() * known).amax(-1) > torch.pi
-    return torch.where(far[..., None, None], left, quat_log(turned))
+    return torch.where(far[..., None, None], left, plain)
 
 
 def quat_rotate(quat_wxyz: Tensor, vector: Tensor) -> Tensor:

@@ -184,23 +184,39 @@ def better_starts(
         values[rows, : len(known)] = fit.values[0, : len(known)]
         values[rows, columns] = torch.tensor(FACTORS).to(values)[:, None] * fit.values[0, len(known) :]
     values[:, len(known) :] = torch.minimum(torch.maximum(values[:, len(known) :], low), high)
+    values, owner, place_of = _distinct(values, each)
     every = fits[0].segments.in_world(candidates_world).select(list(range(count)) * len(values))
-    every = every.with_state(State.joined(*(fit.segments.observations.state for fit in fits for _ in FACTORS)))
+    every = every.with_state(State.joined(*(fits[k].segments.observations.state for k in owner)))
     free = torch.arange(len(known)).expand(len(values), -1)
     group = torch.arange(len(values)).repeat_interleave(count)
     found = fit_groups(every, parameters, values, free, group, HELD_ITERATIONS)
-    costs = found.chi2.unflatten(0, (len(variants), each, count)).sum(-1)
+    costs = found.chi2.unflatten(0, (len(values), count)).sum(-1)[place_of]
     starts = []
     for k, (variant, fit) in enumerate(zip(variants, fits, strict=True)):
         best = int(costs[k].argmin())
         if float(costs[k, best]) >= fit.cost:
             starts.append((fit.segments, fit.values[0]))
             continue
-        row = k * each + best
+        row = int(place_of[k, best])
         states = found.segments.observations.state.at(torch.arange(row * count, (row + 1) * count))
         columns = [*range(len(known)), *(place[name] for name in variant.parameters)]
         starts.append((fit.segments.with_state(states), found.values[row, columns]))
     return starts
+
+
+def _distinct(values: Tensor, each: int) -> tuple[Tensor, list[int], Tensor]:
+    """Return values without those that occur again: multiples of 0 are all the same, and a bound stops large ones.
+
+    Args:
+        values: Of some variants, `each` rows for each of them (V each, P).
+        each: Number of rows of a variant.
+
+    Returns:
+        The rows that differ (D, P), the variant of each, and for each row of a variant its place among them (V, each).
+    """
+    owner = torch.arange(len(values)) // each
+    keys, place = torch.cat((owner[:, None].to(values), values), 1).unique(dim=0, return_inverse=True)
+    return keys[:, 1:], keys[:, 0].long().tolist(), place.unflatten(0, (-1, each))
 
 
 def noiseless_misfits(

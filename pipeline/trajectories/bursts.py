@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from ..geometry.rotation import continuous_turns, quat_to_matrix
@@ -163,7 +162,7 @@ def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path |
     basis = np.broadcast_to(powers, (int(axes.sum()), *powers.shape))
     if kind == 0 and turned:
         # a marker beside the centre of mass turns with the body
-        turn = CubicSpline(t[known], quat_to_matrix(quat).numpy()[known])(t)[:, axes].swapaxes(0, 1)
+        turn = _filled(t, quat_to_matrix(quat).numpy(), known)[:, axes].swapaxes(0, 1)
         basis = np.concatenate((basis, turn), 2)
     opens = item.first <= int((whole.seen[item.episode].amax(-1) > 0).to(torch.int64).argmax())
     free_s = t[0] + LIMITS.longest_burst_s * opens
@@ -177,6 +176,15 @@ def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path |
         free_s=free_s,
     )
     return path if path.free >= LEAST_FREE else None
+
+
+def _filled(times_s: Array, values: Array, known: NDArray[np.bool_]) -> Array:
+    """Return values (n, ...) at times (n,) [s], by a cubic spline through the known ones where one is not known."""
+    if known.all():
+        return values
+    from scipy.interpolate import CubicSpline
+
+    return CubicSpline(times_s[known], values[known])(times_s)
 
 
 def _usual(paths: Sequence[_Path]) -> float:
