@@ -183,16 +183,13 @@ def test_the_interval_covers_the_median_difference() -> None:
 
 def flights(root: Path, model: Model, turned: bool = True) -> Path:
     """Replace the throws of a capture by long flights of a model, all in another direction."""
-    times = np.arange(40) / 50
-    for seed, path in enumerate(sorted((root / "tracks").iterdir())):
-        state = State(
-            torch.tensor([[[-0.5, 0.1 * seed, 2.0]]]).double(),
-            torch.tensor([[[1.0, 0.0, 0.0, 0.0]]]).double(),
-            torch.tensor([[[0.5 - 0.2 * seed, 0.3, 2.5]]]).double(),
-            torch.tensor([[[1.0, 0.5 * seed, 0.0]]]).double(),
-        )
-        rollout = simulate(World.from_model(model), state, torch.tensor(times))
-        motion = Motion(rollout.position_m[0].numpy(), rollout.quat_wxyz[0].numpy())
+    times, paths = np.arange(40) / 50, sorted((root / "tracks").iterdir())
+    rows = [((-0.5, 0.1 * k, 2.0), (0.5 - 0.2 * k, 0.3, 2.5), (1.0, 0.5 * k, 0.0)) for k in range(len(paths))]
+    place, velocity, omega = (torch.tensor(part).double()[:, None] for part in zip(*rows, strict=True))
+    upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).double().expand(len(paths), 1, 4)
+    rollout = simulate(World.from_model(model), State(place, upright, velocity, omega), torch.tensor(times))
+    for seed, path in enumerate(paths):
+        motion = Motion(rollout.position_m[seed].numpy(), rollout.quat_wxyz[seed].numpy())
         write_tracks(path, {"cube": measured(times, motion, seed, turned)}, overwrite=True)
     return root
 
