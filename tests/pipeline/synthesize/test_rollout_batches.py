@@ -24,6 +24,7 @@ CONFIG = SynthesizeConfig(
 )
 FEW_FRAMES = CONFIG.model_copy(update={"frame_rate_hz": 10.0})
 """Of the same motions: each image takes longer than the steps between two."""
+FIVE = FEW_FRAMES.model_copy(update={"rollouts": 5})
 CUDA = torch.cuda.is_available() and kernel_build.available()
 NEEDS_GPU = pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core")
 NEEDS_COMPILER = pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
@@ -35,7 +36,7 @@ def hashes(model: Path, folder: Path, config: SynthesizeConfig, sizes: tuple[int
 
 
 def test_the_batch_changes_no_byte(tmp_path: Path) -> None:
-    assert len(hashes(write_small_model(tmp_path / "model"), tmp_path, FEW_FRAMES, sizes=(1, 8))) == 1
+    assert len(hashes(write_small_model(tmp_path / "model"), tmp_path, FIVE, sizes=(1, 4))) == 1
 
 
 @NEEDS_COMPILER
@@ -119,7 +120,7 @@ def test_worlds_are_joined_by_their_numbers() -> None:
 
 def test_one_that_diverges_is_drawn_again_and_takes_none_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = write_small_model(tmp_path / "model")
-    synthesize(model, tmp_path / "whole", FEW_FRAMES)
+    synthesize(model, tmp_path / "whole", FIVE)
     simulate, calls = batches.roll_out, []
 
     def diverge(*arguments: object, **options: object) -> object:
@@ -128,12 +129,12 @@ def test_one_that_diverges_is_drawn_again_and_takes_none_along(tmp_path: Path, m
         return replace(rollout, position_m=rollout.position_m * torch.nan) if calls[-1] == 3 else rollout
 
     monkeypatch.setattr(batches, "roll_out", diverge)
-    summary = synthesize(model, tmp_path / "out", FEW_FRAMES)
+    summary = synthesize(model, tmp_path / "out", FIVE)
     (note,) = (note for note in summary.notes if "drawn again" in note)
     assert "drawn again: rollout 3 (seed 5) diverged by step 0" in note
-    assert summary.rollouts == 9 and summary.rejected == {"diverged": 1}
+    assert summary.rollouts == 5 and summary.rejected == {"diverged": 1}
     whole, other = RolloutReader(tmp_path / "whole"), RolloutReader(tmp_path / "out")
-    for number in range(9):
+    for number in range(5):
         same = [np.array_equal(other.read(number, key), whole.read(number, key)) for key in other.keys(number)]
         assert all(same) == (number != 3)
     whole.close()
