@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -61,6 +62,12 @@ def ready(body: str, effects: dict, change: Callable[[Track], Track] | None, see
     return prepare(world, episodes if change is None else changed(episodes, change)), world
 
 
+@cache
+def tossed_ball(change: Callable[[Track], Track] | None) -> tuple[Prepared, object]:
+    """Return tosses of a ball in which nothing is missing, as `ready` has them; several tests look at them."""
+    return ready("ball", {}, change)
+
+
 def test_innovations_are_what_the_inverse_of_the_covariance_says() -> None:
     rng = np.random.default_rng(0)
     times = torch.as_tensor(np.sort(rng.uniform(0, 0.3, (2, 12)).round(9), axis=1))  # times closer than 1 ns are one
@@ -95,7 +102,7 @@ def test_errors_that_last_are_measured(body: str) -> None:
     [("ball", {}), ("cube", {"com_offset": {"d_x": 0.008}}), ("ball", {"ground_magnet": {"A": 12.0}})],
 )
 def test_errors_that_do_not_last_are_not_taken_for_such(body: str, effects: dict) -> None:
-    prepared, _ = ready(body, effects, None)
+    prepared, _ = ready(body, effects, None) if effects else tossed_ball(None)
     assert prepared.noise_model == WHITE
     assert prepared.flight is not None and prepared.flight.noise_model == WHITE
 
@@ -138,7 +145,7 @@ def test_they_are_no_effect(change: Callable[[Track], Track]) -> None:
 
 @pytest.mark.parametrize("change", EACH)
 def test_they_hide_no_effect(change: Callable[[Track], Track]) -> None:
-    prepared, world = ready("ball", {}, change)
+    prepared, world = tossed_ball(change)
     assert prepared.noise_model != WHITE
     blind = replace(prepared, noise_model=NoiseModel())
     assert prepared.flight is not None
@@ -151,8 +158,8 @@ def test_they_hide_no_effect(change: Callable[[Track], Track]) -> None:
 
 
 def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
-    sharp, _ = ready("ball", {}, None)
-    smeared, _ = ready("ball", {}, smoothed)
+    sharp, _ = tossed_ball(None)
+    smeared, _ = tossed_ball(smoothed)
     seen = sharp.observations.seen.amax(-1) > 0
     for episode in range(len(sharp.names)):
         contact = np.flatnonzero((~sharp.airborne & seen)[episode].numpy())
@@ -165,7 +172,7 @@ def test_frames_beside_a_smoothed_contact_are_no_flight() -> None:
 
 @pytest.mark.parametrize(("share", "reach"), [(0.99, 5), (0.9, 3)])
 def test_errors_with_a_white_part_come_from_no_filter_which_would_smear_contacts(share: float, reach: int) -> None:
-    sharp, _ = ready("ball", {}, None)
+    sharp, _ = tossed_ball(None)
     contact = torch.zeros_like(sharp.airborne)
     contact[0, 10] = True
     errors = NoiseModel(CorrelatedNoise(share, 0.06, order=2.5), CorrelatedNoise())

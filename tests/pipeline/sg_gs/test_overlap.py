@@ -14,7 +14,7 @@ from cgwm.schemas import InputDataError
 from pipeline.sg_gs.test_sg_gs import CONFIG, PLACE, RADIUS, make_capture
 
 BALL = f"shape = {{ sphere = {{ radius_m = {RADIUS} }} }}"
-QUICK = CONFIG.model_copy(update={"iterations": 2})
+QUICK = CONFIG.model_copy(update={"iterations": 2, "bare_ground": False, "flat_faces": False, "image_size": 48})
 
 
 def points(count: int = 200) -> np.ndarray:
