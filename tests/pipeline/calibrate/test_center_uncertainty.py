@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cgwm.pipeline.calibrate import pose_posterior
+from cgwm.pipeline.calibrate import attempts, pose_posterior
 from cgwm.pipeline.calibrate.center_uncertainty import center_stds, rotation_stds
 from cgwm.pipeline.calibrate.metric_scale import umeyama
 from cgwm.pipeline.calibrate.pose_posterior import posterior, principal_points
@@ -120,6 +121,20 @@ def test_a_photo_of_its_own_camera_does_not_tell_its_principal_point() -> None:
     turns = rotation_stds(two, models)
     assert turns["03.jpg"] == max(turns.values())
     assert np.degrees(turns["03.jpg"]) > np.degrees(stds["other"].min() / 600.0) * 0.5
+
+
+def test_a_photo_alone_with_its_camera_asks_for_no_finer_places() -> None:
+    model = _noisy(_scene(images=12, points=300), 0)
+    own = {**model.image_camera, "03.jpg": "other"}
+    two = replace(model, image_camera=own, cameras={**model.cameras, "other": model.cameras["photos"]})
+    inputs = SimpleNamespace(known={}, richest={"photos": "RADIAL", "other": "SIMPLE_PINHOLE"})
+    stds = center_stds(two, {**MODELS, "other": "SIMPLE_PINHOLE"})
+    assert stds["03.jpg"] > attempts._ALIGN_ABOVE > max(std for image, std in stds.items() if image != "03.jpg")
+    uncertain = [
+        attempts._uncertain(SimpleNamespace(model=lambda m=m: m), "RADIAL", inputs)
+        for m in (two, _noisy(model, 1, noise_px=2.0))
+    ]
+    assert uncertain == [False, True]
 
 
 def test_is_proportional_to_the_noise_and_free_of_place_and_unit(monkeypatch: pytest.MonkeyPatch) -> None:
