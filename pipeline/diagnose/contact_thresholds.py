@@ -50,6 +50,14 @@ class SlidingThresholds:
     many_parameters: int = threshold(
         4, "parameters", "`score_sure` does not apply to an effect with more: a friction map can fit almost anything"
     )
+    gain_t: float = threshold(
+        1.0,
+        "standard errors",
+        "mean gain of held-out episodes by such an effect",
+        "by argument: as `impact.gain_t`",
+        "real-like development: a map that three episodes speak for and one against was the only false name of sliding "
+        "in 119 captures without an effect (757)",
+    )
     least_size: float = threshold(
         0.3,
         "usual sizes",

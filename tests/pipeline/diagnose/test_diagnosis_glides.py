@@ -143,6 +143,8 @@ def named_in_sliding(given: list[Evidence], flown: bool, explained: bool = True)
         ("viscous_friction", (500.0, 150.0, -200.0), False),  # the others predict each other worse than without it
         ("anisotropic_friction", (300.0, 290.0, 0.0), False),  # two slides are braked along and across: any law fits
         ("anisotropic_friction", (300.0, 290.0, 60.0), True),
+        ("friction_patch", (-115.0, 44.0, 108.0, 3.0, 233.0), False),  # a map fits three of five
+        ("friction_patch", (0.0, 44.0, 108.0, 3.0, 233.0), True),
     ],
 )
 def test_slides_of_other_episodes_have_to_predict_what_is_named(
