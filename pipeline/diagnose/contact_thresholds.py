@@ -199,6 +199,20 @@ class SegmentsThresholds:
         "of 9 false names of 83 nulls of the fourth report of real-like captures 7 came from segments alone; without "
         "them 1 of 26 effects of contact is lost",
     )
+    alone: tuple[str, ...] = threshold(
+        ("torsional_friction",),
+        "effects",
+        "named here without slides: laws of contact differ in how they push, none has a torque about the normal",
+        BY_ARGUMENT,
+        "see `alone_score`",
+    )
+    alone_score: float = threshold(
+        15.0,
+        "chi2",
+        "score of such an effect, which must rank first",
+        "real-like development, 498 captures of three engines without an effect of contact: at most 10",
+        "the same captures: 4 of 8 true ones have more",
+    )
     lead_share: float = threshold(0.5, "1", "another effect within this share of the best score is not separable")
     confirmed: float = threshold(2.0, "standard errors", "distance from zero that a refit must leave")
     separate_chi2: float = threshold(

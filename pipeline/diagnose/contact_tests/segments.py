@@ -2,8 +2,9 @@
 
 No contact law is exact, and its error is the same in all episodes: restitution that depends on the speed, a pull at the
 ground or a friction by direction describe how another law differs from the model's, repeat from episode to episode, and
-predict held-out ones. Segments alone therefore name nothing. They confirm an effect of one parameter that ranks first
-among slides, too. Every segment has its own deviations of the contact parameters, segments that no candidate explains
+predict held-out ones. Segments alone therefore name none of these: they confirm an effect of one parameter that ranks
+first among slides, too. A torque about the normal is no error of such a law, which has none at a point, and needs no
+slides. Every segment has its own deviations of the contact parameters, segments that no candidate explains
 are downweighted, and the effect has to improve held-out episodes and to exceed its scatter between episodes.
 """
 
@@ -78,11 +79,13 @@ class SegmentsTest(ContactTest):
         return (Lead(share=self.limits.lead_share, rival=Bar(gain_t=self.limits.gain_t)),)
 
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
-        """Return the bar of an effect that slides have shown before; none for any other one."""
+        """Return the bar of an effect that slides have shown, or that no law imitates; none for any other one."""
         best = equals[0]
         few = len(best.candidate.effect.parameters) <= THRESHOLDS.sliding.few_parameters
         if not few or not repeats(best, 1):
             return ()
+        if best.name in self.limits.alone:
+            return (Bar(score=self.limits.alone_score, gain_t=self.limits.gain_t),)
         slides = next((one for one in data.earlier.get("sliding", ()) if one.test.admissible), None)
         if slides is None or slides.name != best.name or slides.score <= self.limits.agreed_score:
             return ()

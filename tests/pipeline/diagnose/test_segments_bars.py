@@ -45,6 +45,12 @@ def test_an_effect_that_ranks_first_among_slides_is_confirmed() -> None:
     assert bars(evidence("anisotropic_friction"), sliding=("anisotropic_friction",)) == []  # two numbers fit two slides
 
 
+def test_a_torque_about_the_normal_needs_no_slides() -> None:
+    """No law of contact has one at a point, whatever its restitution and friction are."""
+    assert bars(evidence("torsional_friction")) == [LIMITS.alone_score]
+    assert bars(replace(evidence("torsional_friction"), repetition=Repetition(3.0, 0.2, 0.3))) == []
+
+
 @pytest.mark.parametrize("repetition", [None, Repetition(3.0, 0.2, 0.3), Repetition(1.0, 1e-6, 0.5)])
 def test_what_does_not_repeat_from_episode_to_episode_is_not_confirmed(repetition: Repetition | None) -> None:
     one = replace(evidence("viscous_friction"), repetition=repetition)
