@@ -100,8 +100,11 @@ def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> 
     if result.flight_before is not None and result.flight_after is not None:
         before, after = result.flight_before.statistic, result.flight_after.statistic
         added = f", with {listed(result.selected)} {after:.2f}" if result.selected else ""
-        lines.append(f"flight, mean chi2 of the residual: {before:.2f}{added} (1: noise)")
-    lines += [*_limits(result.contact_limits), *_held_out_errors(result.ranking)]
+        lines.append(
+            f"flight of '{split}', mean chi2 of one more force in each piece of at most 0.3 s: {before:.2f}{added} "
+            "(1: noise; cgwm compare states that of measured positions)"
+        )
+    lines += [*_limits(result.contact_limits), *_held_out_errors(result.ranking, split)]
     lines += _remaining(result.remaining)
     if result.residual_law is not None:
         terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms) or "no term"
@@ -121,8 +124,8 @@ def _shown(result: DiagnoseResult) -> list[RankedEffect]:
     return shown[:SHOWN]
 
 
-def _held_out_errors(ranking: Sequence[RankedEffect]) -> list[str]:
-    """Return the errors, without and with each effect, in episodes that its fit did not use."""
+def _held_out_errors(ranking: Sequence[RankedEffect], split: str) -> list[str]:
+    """Return the errors, without and with each effect, in episodes of the split that its fit did not use."""
     from .output import millimetres
 
     lines = []
@@ -130,8 +133,12 @@ def _held_out_errors(ranking: Sequence[RankedEffect]) -> list[str]:
     beside = ", beside the others" if len(tried) > 1 else ""
     for one in tried:
         errors = f"{millimetres(one.cv_error_before_m or 0.0)} -> {millimetres(one.cv_error_after_m or 0.0)}"
-        what = f"error of short predictions in held-out episodes, without and with it{beside}"
-        lines.append(f"{one.effect}: {what}: {errors}")
+        lines.append(
+            f"{one.effect}: error in episodes of '{split}' held out in turn, without and with it{beside}: {errors}"
+        )
+    if lines:
+        first = "(of the second half of each piece of motion, from its first half; cgwm compare starts from 0.1 s of a "
+        lines.append(f"{first}whole episode, and its errors are larger)")
     return lines
 
 

@@ -165,7 +165,9 @@ def _check_header(path: Path, header: list[str]) -> None:
     allowed = ", ".join(COLUMNS)
     todo = "correct the header; values are in SI units (m, s, rad, N)."
     if not header:
-        raise InputDataError(f"{path}: the file is empty.", f"a header line of {allowed}.")
+        raise InputDataError(
+            f"{path}: the file is empty.", f"a header line of {allowed}.", "write it again, or remove its episode."
+        )
     for column in header:
         if column not in COLUMNS:
             raise InputDataError(
@@ -214,7 +216,8 @@ def _columns(
                 fault = f"{shown(row[index])} is no number" if row[index].strip() else "the value is missing"
                 raise InputDataError(
                     f"{path}, line {line}: body '{body}', column '{names[j]}': {fault}.",
-                    "finite numbers; leave out the whole line where nothing was measured.",
+                    "finite numbers.",
+                    "correct the value, or leave out the whole line where nothing was measured.",
                 ) from None
             if not math.isfinite(values[k, j]):
                 raise InputDataError(

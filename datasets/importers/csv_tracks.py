@@ -90,6 +90,7 @@ def import_csv(
                 raise InputDataError(
                     f"--columns: '{name}' is nothing that a column can be.",
                     f"{', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}",
+                    "correct it, or leave it out.",
                 )
         files = track_files(Path(source), (".csv",))
         left_out: Counter[str] = Counter()
@@ -251,7 +252,9 @@ def _units(path: Path, names: list[str], index: Mapping[str, int], units: Units)
         named |= {getattr(units, kind)} - {None}
         if len(named) > 1:
             raise InputDataError(
-                f"{path}: units of {kind} that differ: {', '.join(sorted(named))}.", "one unit for all columns."
+                f"{path}: units of {kind} that differ: {', '.join(sorted(named))}.",
+                "one unit for all columns.",
+                "convert the columns to one unit, and name it in the first line.",
             )
         units = replace(units, **{kind: next(iter(named), None)})
     return units
@@ -262,7 +265,9 @@ def _place(path: Path, names: list[str], key: str, columns: Mapping[str, str]) -
     if key in columns:
         if columns[key] not in names:
             raise InputDataError(
-                f"{path}: no column '{columns[key]}' (--columns {key}={columns[key]}).", f"{', '.join(names)}."
+                f"{path}: no column '{columns[key]}' (--columns {key}={columns[key]}).",
+                f"{', '.join(names)}.",
+                f"choose one of these: --columns {key}=NAME.",
             )
         return names.index(columns[key])
     hits = [k for k, name in enumerate(names) if _plain(name)[0] in _NAMES[key]]
@@ -291,6 +296,8 @@ def _number(path: Path, line: int, row: list[str], header: _Header, key: str) ->
     except ValueError:
         fault = f"{shown(cell)} is no number" if cell else "the time is missing"
         raise InputDataError(
-            f"{path}, line {line}: {key}: {fault}.", "numbers; empty or nan where nothing was seen."
+            f"{path}, line {line}: {key}: {fault}.",
+            "numbers; empty or nan where nothing was seen.",
+            "correct the line, or remove it.",
         ) from None
     return number

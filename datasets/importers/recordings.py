@@ -111,7 +111,9 @@ class Units:
             note(f"{where}: {gaps} of {len(seen)} samples have no pose and are left out")
         time, position = time[seen], position[seen]
         if len(time) < 2:
-            raise InputDataError(f"{where}: {len(time)} samples with a pose.", "at least 2.")
+            raise InputDataError(
+                f"{where}: {len(time)} samples with a pose.", "at least 2.", "leave this recording out."
+            )
         if not np.isfinite(time).all():
             raise InputDataError(
                 f"{where}: {np.count_nonzero(~np.isfinite(time))} times are not finite.",
@@ -130,9 +132,17 @@ class Units:
         )
         for name, unit, values in (("times", "s", track.time_s), ("positions", "m", track.position_m)):
             if (largest := float(np.abs(values).max())) > LARGEST:
-                raise InputDataError(f"{where}: {name} up to {largest:.4g} {unit}.", f"up to {LARGEST:g} {unit}.")
+                raise InputDataError(
+                    f"{where}: {name} up to {largest:.4g} {unit}.",
+                    f"up to {LARGEST:g} {unit}.",
+                    "check the unit and the samples, and leave out wrong ones.",
+                )
         if (shortest := float(np.diff(track.time_s).min())) < SHORTEST_STEP_S:
-            raise InputDataError(f"{where}: two times are {shortest:.2g} s apart.", f"{SHORTEST_STEP_S:g} s or more.")
+            raise InputDataError(
+                f"{where}: two times are {shortest:.2g} s apart.",
+                f"{SHORTEST_STEP_S:g} s or more.",
+                "check the unit of the times, and remove repeated samples.",
+            )
         return track
 
     def _check(self, where: str, time: Array, position: Array) -> None:
@@ -172,12 +182,12 @@ def track_files(source: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """
     allowed = f"a {' or '.join(suffixes)} file, or a folder of them."
     if not os.path.lexists(source):
-        raise InputDataError(f"{source}: no such file or directory.", allowed)
+        raise InputDataError(f"{source}: no such file or directory.", allowed, "check the path.")
     if not source.is_dir():
         return [require_regular_file(source)]
     files = [require_regular_file(path) for path in entries_of(source) if path.suffix.lower() in suffixes]
     if not files:
-        raise InputDataError(f"{source}: no {' or '.join(suffixes)} files.", allowed)
+        raise InputDataError(f"{source}: no {' or '.join(suffixes)} files.", allowed, "check the path and the format.")
     return files
 
 
@@ -283,6 +293,7 @@ def drawn_splits(
         raise InputDataError(
             f"{max(n_train, 0)} training and {max(n_test, 0)} test episodes of {len(order)} recordings.",
             f"at least 1 to train on, and no more than {len(order)} together.",
+            "change --train or --test, or leave them out.",
         )
     splits = {"train": tuple(order[:n_train]), "test": tuple(order[n_train : n_train + n_test])}
     return {name: episodes for name, episodes in splits.items() if episodes}
@@ -360,7 +371,9 @@ def _require_as_many(where: str, **parts: Array | None) -> None:
     counts = {name: len(values) for name, values in parts.items() if values is not None}
     if len(set(counts.values())) > 1:
         raise InputDataError(
-            f"{where}: {', '.join(f'{count} {name}' for name, count in counts.items())}.", "as many of each."
+            f"{where}: {', '.join(f'{count} {name}' for name, count in counts.items())}.",
+            "as many of each.",
+            "take the original, or fill in nan where nothing was measured.",
         )
 
 
@@ -394,7 +407,7 @@ def _force(where: str, force_n: Array) -> Array | None:
             "fill them in, or leave out the lines.",
         )
     if (largest := float(np.abs(force_n).max())) > LARGEST:
-        raise InputDataError(f"{where}: forces up to {largest:.4g} N.", f"up to {LARGEST:g} N.")
+        raise InputDataError(f"{where}: forces up to {largest:.4g} N.", f"up to {LARGEST:g} N.", "check their unit.")
     return force_n
 
 

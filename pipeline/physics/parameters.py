@@ -173,7 +173,10 @@ def effect_parameters(world: World) -> list[Parameter]:
             low = 0.0 if number.nonnegative else -number.limit
             name, prior = f"{effect.name}.{number.name}", (0.0, PRIOR_SCALES * number.scale)
             beyond = "the effect would be stronger than its formula admits: something else is missing, or in its place"
-            least = "these data do not show the effect: leave it out" if number.nonnegative else beyond
+            one = "the effect: leave it out"
+            if len(effect.parameters) > 1:
+                one = f"{number.name}: the other numbers of the effect stay, this one may go from its formula"
+            least = f"these data do not show {one}" if number.nonnegative else beyond
             bounds = (low, number.limit)
             found.append(
                 Parameter(
