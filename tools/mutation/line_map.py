@@ -84,7 +84,7 @@ class LineMap:
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
         """Write the lines of a test that passed."""
         by_file: dict[str, list[int]] = defaultdict(list)
-        for path, line in self.lines:
+        for path, line in self.lines.copy():  # threads that a test left behind add to it meanwhile
             by_file[path].append(line)
         entry = self.tests.pop(nodeid, {"passed": False})
         if entry["passed"]:
