@@ -1,6 +1,7 @@
 """A LEAP hand turns a cube to random orientations: the controller of cgwm on the scene of judo-rai.
 
 python benchmarks/hand.py run --scene FOLDER [--first 0] [--seeds 5] [--clock ideal|real|cpu] [--contenders mppi,cem]
+       [--plant friction_factor=0.5] [--limit 300]
 python benchmarks/hand.py table
 
 FOLDER is `judo/models` of the wheel of judo-rai 0.1.0 (MIT; `pip download --no-deps judo-rai==0.1.0`), with the meshes
@@ -9,17 +10,20 @@ of google-deepmind/mujoco_menagerie's leap_hand, of which only `tip` and `thumb_
 scene. A goal counts within 0.4 rad; a run ends at 20 goals, a drop, after 80 s without a goal, or at its length.
 Clocks: real charges each plan its wall time, cpu the time of all processors (what one idle core would need), ideal
 nothing. Contenders: mppi, both, gauss-newton; `hold` never moves: what the goals give by chance; `cem`: see
-`hand_cem.py`, with compute for free.
+`hand_cem.py`, with compute for free (`--clock ideal --hz 20`). A run that reaches the limit of wall time is "cut". For
+a real clock on some cores of a machine: `taskset -c`, one process each.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import math
 import os
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from itertools import combinations, product
 from pathlib import Path
@@ -31,9 +35,10 @@ from cgwm.datasets.models.model import Model
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import run_hand
-from cgwm.pipeline.control.hand_plant import HandScenePlant
+from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
+from cgwm.pipeline.control.horizon import Array
 from cgwm.pipeline.control.solvers import Solution
-from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, Pose, Provenance
+from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, NotConvergedError, Pose, Provenance
 from hand_cem import CemController
 from processor_clock import charge_processors
 from store import Store
@@ -90,6 +95,7 @@ def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
     ]
     touching += [(finger[-1], "leap_hand") for finger in fingers]  # what the scene does not exclude, fingers apart
     tips = {f"{finger}_ds/3": TIP_FRICTION for finger in ("if", "mf", "rf", "th")}  # the last part of each
+    errors = {name: float(value) for name, _, value in (one.partition("=") for one in given.plant.split(",") if one)}
     task = HandTask.model_validate(
         {
             "robot": {
@@ -108,7 +114,7 @@ def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
                 "step_s": given.step,
             },
             "success": {"turn_deg": math.degrees(0.4), "drop_m": 0.4, "goals": 20, "timeout_s": given.seconds},
-            "plant": {"kind": "mujoco", "scene": "xml/leap_cube_sim.xml", "body": "cube"},
+            "plant": {"kind": "mujoco", "scene": "xml/leap_cube_sim.xml", "body": "cube", **errors},
         }
     )
     task._source = str(folder / "task.toml")
@@ -123,7 +129,27 @@ class Hold:
         return Solution(torch.zeros_like(warm), 0.0)
 
 
-def measure(name: str, task: HandTask, seed: int, clock: str, device: str) -> dict[str, Any]:
+class Limited:
+    """A plant that stops at a time of the machine.
+
+    Args:
+        plant: The plant.
+        end_s: The time [s], as of `time.monotonic`.
+    """
+
+    def __init__(self, plant: HandScenePlant, end_s: float) -> None:
+        self.reset, self._plant, self._end_s = plant.reset, plant, end_s
+        self.cut = False
+
+    def advance(self, target_rad: Array, interval_s: float) -> HandTruth:
+        """See `HandPlant`."""
+        self.cut = time.monotonic() > self._end_s
+        if self.cut:
+            raise NotConvergedError("the time is up.")
+        return self._plant.advance(target_rad, interval_s)
+
+
+def measure(name: str, task: HandTask, seed: int, clock: str, device: str, end_s: float) -> dict[str, Any]:
     """Return the figures of one run."""
     if name == "cem":
         controller = CemController(cube(), task)
@@ -135,11 +161,14 @@ def measure(name: str, task: HandTask, seed: int, clock: str, device: str) -> di
     if clock == "cpu":
         charge_processors(controller)
     before = os.getloadavg()[0]
-    found = run_hand(controller, HandScenePlant(controller.hand), seed, "ideal" if clock == "ideal" else "real")
+    plant = Limited(HandScenePlant(controller.hand), end_s)
+    gc.collect()
+    gc.freeze()  # what is there before the run is never garbage: no plan waits for its being looked at
+    found = run_hand(controller, plant, seed, "ideal" if clock == "ideal" else "real")
     wall, cpu = (1e3 * found.column(key, "plans") for key in ("wall_s", "cpu_s"))
     reached = found.column("reached")
     return {
-        "ended": found.ended,
+        "ended": "cut" if plant.cut else found.ended,
         "time_s": round(len(reached) * controller.interval_s, 2),
         "goals": found.goals,
         "first_s": round(float(np.flatnonzero(reached)[0] + 1) * controller.interval_s, 2) if found.goals else None,
@@ -148,6 +177,7 @@ def measure(name: str, task: HandTask, seed: int, clock: str, device: str) -> di
         "plans": len(wall),
         "late": found.late,
         "plan_ms": round(float(np.median(wall)), 1),
+        "plan_95_ms": round(float(np.percentile(wall, 95)), 1),
         "plan_cpu_ms": round(float(np.median(cpu)), 1),
         "load": round(0.5 * (before + os.getloadavg()[0]), 1),
     }
@@ -183,7 +213,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=60.0, help="length of a run")
     parser.add_argument("--hz", type=float, default=50.0)
-    parser.add_argument("--samples", type=int, default=32)
+    parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--corners", type=int, default=24, help="of the shape of a part of a link")
     parser.add_argument(
         "--touching", action=argparse.BooleanOptionalAction, default=True, help="fingers touch each other"
@@ -193,7 +223,10 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the predictions")
     parser.add_argument("--store", type=Path, default=None)
     parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
+    parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
+    parser.add_argument("--limit", type=float, default=math.inf, help="wall time after which runs are cut [s]")
     given = parser.parse_args()
+    end_s = time.monotonic() + given.limit
     store = Store("hand", given.store, given.any_commit)
     if given.work == "table":
         print(" | ".join(HEADER))
@@ -208,8 +241,11 @@ def main() -> None:
         for seed in range(given.first, given.first + given.seeds):
             for name in given.contenders.split(","):
                 size = f"{given.samples} x {given.horizon:g} s in steps of {1e3 * given.step:g} ms"
-                key = f"{name}, {given.clock}, {given.hz:g} Hz, {size}, {given.device}/{seed}"
-                store.result(key, lambda n=name, s=seed: measure(n, task, s, given.clock, given.device))
+                if time.monotonic() > end_s:
+                    return
+                kind = f"{given.device}, {given.plant}" if given.plant else given.device
+                key = f"{name}, {given.clock}, {given.hz:g} Hz, {size}, {kind}/{seed}"
+                store.result(key, lambda n=name, s=seed: measure(n, task, s, given.clock, given.device, end_s))
 
 
 if __name__ == "__main__":

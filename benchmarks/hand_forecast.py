@@ -4,8 +4,9 @@ python benchmarks/hand_forecast.py --scene FOLDER [--seeds 200,201] [--seconds 1
 
 FOLDER as for `hand.py`. cgwm's controller turns the cube in the scene `xml/leap_cube_sim.xml` without a clock. From
 every third of the states that occur, the commands that followed are applied again in the predicting model. Given are
-medians over states of distance and turn between its cube and that of the scene after 0.1, 0.25 and 0.5 s, and CPU time
-a step. `still` is a cube that stays; `MuJoCo, 10 ms` is the scene in which judo plans, `xml/leap_cube.xml`.
+medians over states of distance and turn between its cube and that of the scene and of the largest error of a joint,
+after 0.1, 0.25 and 0.5 s, and CPU time a step. `still` is a cube that stays; `MuJoCo, 10 ms` is the scene in which
+judo plans, `xml/leap_cube.xml`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_objective import turn_to
 from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
 from cgwm.pipeline.control.horizon import Array
+from cgwm.pipeline.physics.chain_state import joints_of
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.physics.world import State
@@ -40,17 +43,18 @@ INTERVAL_S, AHEAD, EVERY = 0.05, 10, 3
 CHECKED = (2, 5, 10)
 """Commands after the start at which predictions are compared."""
 COMPARED = (
-    (0.002, 24, 0.01), (0.0003, 12, 0.01), (0.0003, 24, 0.02), (0.0003, 24, 0.01), (0.0003, 24, 0.005),
-    (0.0003, 24, 0.002),
+    (0.002, 24, 0.01, True), (0.0003, 12, 0.01, True), (0.0003, 24, 0.02, True), (0.0003, 24, 0.01, False),
+    (0.0003, 24, 0.01, True), (0.0003, 24, 0.005, True), (0.0003, 24, 0.002, True),
 )  # fmt: skip
-"""Radius by which corners are rounded [m], corners of a part, and step [s] of the predictions compared."""
+"""Radius by which corners are rounded [m], corners of a part, step [s] and whether fingers touch each other, of the
+predictions compared."""
 COLUMNS = {
     "position_m": "position_m", "quat_wxyz": "quat_wxyz", "velocity_m_s": "velocity_m_s",
     "omega_body_rad_s": "omega_body_rad_s", "joints": "joints_rad", "speeds": "speeds_rad_s",
 }  # fmt: skip
 """Columns of a recording with the state before each command, and the fields of the state."""
-Motion = tuple[Array, Array]
-"""Positions (starts, AHEAD + 1, 3) [m] and orientations (starts, AHEAD + 1, 4) of the cube."""
+Motion = tuple[Array, Array, Array]
+"""Positions (starts, AHEAD + 1, 3) [m] and orientations (starts, AHEAD + 1, 4) of the cube, and joints [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,10 +67,19 @@ class Moment:
     """Targets before the start and at the end of each command, shape (AHEAD + 1, joints)."""
 
 
-def task_of(folder: str, scene: Path, corners: int, step_s: float, seconds: float = 60.0) -> HandTask:
+def task_of(
+    folder: str, scene: Path, corners: int, step_s: float, seconds: float = 60.0, touching: bool = True
+) -> HandTask:
     """Return the task of `hand.py` with plans of 64 samples over 0.5 s."""
     given = argparse.Namespace(
-        corners=corners, hz=1 / INTERVAL_S, samples=64, horizon=0.5, step=step_s, seconds=seconds, touching=True
+        corners=corners,
+        hz=1 / INTERVAL_S,
+        samples=64,
+        horizon=0.5,
+        step=step_s,
+        seconds=seconds,
+        touching=touching,
+        plant="",
     )
     return hand.task_in(Path(folder), scene, given)
 
@@ -86,15 +99,15 @@ def moments_of(scene: Path, seed: int, seconds: float) -> Iterator[Moment]:
 def still(moments: list[Moment]) -> Motion:
     """Return the motion of a cube that stays."""
     starts = [moment.truths[0] for moment in moments]
-    places = (np.stack([start.position_m for start in starts]), np.stack([start.quat_wxyz for start in starts]))
-    position, quat = (np.repeat(values[:, None], AHEAD + 1, 1) for values in places)
-    return position, quat
+    fields = ([getattr(start, name) for start in starts] for name in ("position_m", "quat_wxyz", "joints_rad"))
+    position, quat, joints = (np.repeat(np.stack(values)[:, None], AHEAD + 1, 1) for values in fields)
+    return position, quat, joints
 
 
-def predicted(moments: list[Moment], scene: Path, corners: int, step_s: float) -> Motion:
+def predicted(moments: list[Moment], scene: Path, corners: int, step_s: float, touching: bool) -> Motion:
     """Return what cgwm predicts."""
     with tempfile.TemporaryDirectory() as folder:
-        found = HandController(hand.cube(), task_of(folder, scene, corners, step_s)).hand
+        found = HandController(hand.cube(), task_of(folder, scene, corners, step_s, touching=touching)).hand
         starts = [
             moment.truths[0].measured(0.0, moment.truths[0].position_m, moment.truths[0].quat_wxyz)
             for moment in moments
@@ -109,7 +122,10 @@ def predicted(moments: list[Moment], scene: Path, corners: int, step_s: float) -
         times = INTERVAL_S * torch.arange(AHEAD + 1, dtype=torch.float64)
         knots = torch.as_tensor(np.stack([moment.targets_rad for moment in moments]))
         motion = rollout(found.planning(), state, times, {found.chain.name: JointCommand.targets(times[None], knots)})
-    return motion.position_m[:, :, found.object].numpy(), motion.quat_wxyz[:, :, found.object].numpy()
+    fields = (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
+    joints, _ = joints_of(found.world, State(*(x.flatten(0, 1) for x in fields)), found.chain, exact=False)
+    position, quat = (x[:, :, found.object].numpy() for x in fields[:2])
+    return position, quat, joints.unflatten(0, position.shape[:2]).numpy()
 
 
 def simulated(moments: list[Moment], path: Path) -> Motion:
@@ -129,26 +145,29 @@ def simulated(moments: list[Moment], path: Path) -> Motion:
         data.qpos[places], data.qvel[speeds] = start.joints_rad, start.speeds_rad_s
         data.qpos[first : first + 7] = [*start.position_m, *start.quat_wxyz]
         data.qvel[moving : moving + 6] = [*start.velocity_m_s, *start.omega_body_rad_s]
-        poses.append(data.qpos[first : first + 7].copy())
+        poses.append(np.concatenate((data.qpos[first : first + 7], data.qpos[places])))
         for before, after in zip(moment.targets_rad[:-1], moment.targets_rad[1:], strict=True):
             for step in range(1, steps + 1):
                 data.ctrl[servos] = before + (after - before) * step / steps
                 mujoco.mj_step(model, data)
-            poses.append(data.qpos[first : first + 7].copy())
-    found = np.stack(poses).reshape(len(moments), AHEAD + 1, 7)
-    return found[..., :3], found[..., 3:]
+            poses.append(np.concatenate((data.qpos[first : first + 7], data.qpos[places])))
+    found = np.stack(poses).reshape(len(moments), AHEAD + 1, -1)
+    return found[..., :3], found[..., 3:7], found[..., 7:]
 
 
 def row(name: str, moments: list[Moment], predict: Callable[[], Motion], step_s: float | None) -> list[str]:
     """Return a row of the table."""
     begun = time.process_time()
-    position, quat = predict()
+    position, quat, joints = predict()
     spent = time.process_time() - begun
     cells = [name]
     for ahead in CHECKED:
         away = [np.linalg.norm(x[ahead] - m.truths[ahead].position_m) for x, m in zip(position, moments, strict=True)]
         turned = [_turn_deg(x[ahead], m.truths[ahead].quat_wxyz) for x, m in zip(quat, moments, strict=True)]
-        cells.append(f"{1e3 * np.median(away):.1f} mm, {np.median(turned):.1f} deg")
+        off = [np.abs(x[ahead] - m.truths[ahead].joints_rad).max() for x, m in zip(joints, moments, strict=True)]
+        cells.append(
+            f"{1e3 * np.median(away):.1f} mm, {np.median(turned):.1f} deg, {np.degrees(np.median(off)):.1f} deg"
+        )
     steps = len(moments) * AHEAD * INTERVAL_S / step_s if step_s else math.inf
     return [*cells, f"{1e6 * spent / steps:.0f} us"]
 
@@ -174,14 +193,14 @@ def main() -> None:
     moments = [found for seed in given.seeds.split(",") for found in moments_of(scene, int(seed), given.seconds)]
     print(f"{len(moments)} states\n\n| | 0.1 s | 0.25 s | 0.5 s | a step, CPU |\n| --- | --- | --- | --- | --- |")
     print(f"| {' | '.join(row('still', moments, lambda: still(moments), None))} |")
-    predicted(moments[:1], scene, 24, 0.005)  # compiles
+    predicted(moments[:1], scene, 24, 0.005, True)  # compiles
     usual = link_hulls.ROUNDING_M
-    for rounding, corners, step_s in COMPARED:
+    for rounding, corners, step_s, touching in COMPARED:
         link_hulls.ROUNDING_M = rounding
         name = f"cgwm, {corners} corners rounded by {1e3 * rounding:g} mm, {1e3 * step_s:g} ms"
-        print(
-            f"| {' | '.join(row(name, moments, lambda c=corners, s=step_s: predicted(moments, scene, c, s), step_s))} |"
-        )
+        name += "" if touching else ", fingers pass through each other"
+        cells = row(name, moments, partial(predicted, moments, scene, corners, step_s, touching), step_s)
+        print(f"| {' | '.join(cells)} |")
     link_hulls.ROUNDING_M = usual
     xml = scene / "xml"
     print(f"| {' | '.join(row('MuJoCo, 10 ms', moments, lambda: simulated(moments, xml / 'leap_cube.xml'), 0.01))} |")

@@ -19,6 +19,7 @@ from .control import (
     Positive,
     Range,
     Rate,
+    Samples,
     Share,
     TaskSection,
     read_task,
@@ -123,8 +124,10 @@ class HandPlannerSection(PlannerSection):
     """Commands per second [Hz]; more of them reach more goals, where the machine can hold them."""
     horizon_s: HorizonLength = 0.5
     """Length of a plan [s]."""
-    knots: Knots = 4
+    knots: Knots = 10
     """Pieces of a plan, in which the targets change at constant speed."""
+    samples: Samples = 16
+    """Sequences of commands that are compared for a plan; plans that come in time matter more than their number."""
     step_s: Step = 0.01
     """Largest time step of a prediction [s]; contacts are softened to it."""
 

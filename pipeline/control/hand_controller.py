@@ -13,14 +13,12 @@ from ...schemas import HandTask, SolverName, UsageError, read_hand_task
 from ..physics.world import World
 from ..runtime.device import resolve_device
 from .controller import drawn_worlds
+from .elites import Elites
 from .hand_objective import HandObjective
 from .hand_world import HandWorld, hand_world, world_of
 from .horizon import Targets
 from .planning import ControlState, PlanningController
-from .solvers import Mppi, solver_of
-
-NOISE = (0.05, 0.35)
-"""Smallest and largest standard deviation of changed plans, in units of a joint's span."""
+from .solvers import solver_of
 
 
 class HandController(PlanningController):
@@ -66,8 +64,7 @@ class HandController(PlanningController):
             )
 
         worlds = drawn_worlds(model, draws, seed, where, planned)
-        sampling = Mppi(task.planner.samples, noise=NOISE, alike=1, averaged=False)
-        super().__init__(task.planner, worlds, solver_of(solver, sampling), where, seed)
+        super().__init__(task.planner, worlds, solver_of(solver, Elites(task.planner.samples)), where, seed)
 
     @property
     def joints(self) -> tuple[str, ...]:

@@ -68,12 +68,6 @@ class Mppi:
 
     samples: int
     """Number of sequences."""
-    noise: tuple[float, float] = NOISE
-    """Smallest and largest standard deviation of changed plans in units of the bound."""
-    alike: int = NOISE_PIECES
-    """Pieces that noise changes alike."""
-    averaged: bool = True
-    """Whether the mean competes; its rollout alone takes as long as one of as many samples as there are cores."""
 
     def solve(self, objective: Objective, warm: Tensor, propose: Draw, rng: np.random.Generator) -> Solution:
         """See :class:`Solver`."""
@@ -89,17 +83,16 @@ class Mppi:
         near = self._changed(best, max(self.samples - first - 1, 1), objective, rng)
         later = objective.costs(near)
         values, costs = torch.cat((best[None], near)), torch.cat((costs.min()[None], later))
-        if self.averaged:
-            mean = _mean(values, costs)[None]
-            values, costs = torch.cat((values, mean)), torch.cat((costs, objective.costs(mean)))
+        mean = _mean(values, costs)[None]
+        values, costs = torch.cat((values, mean)), torch.cat((costs, objective.costs(mean)))
         chosen = costs.argmin()
         return Solution(values[chosen], float(costs[chosen]))
 
     def _changed(self, values: Tensor, count: int, objective: Objective, rng: np.random.Generator) -> Tensor:
         """Return sequences (count, N, joints) about one (N, joints), within the bound."""
         pieces, joints = objective.shape
-        noise = rng.normal(size=(count, -(-pieces // self.alike), joints)).repeat(self.alike, 1)[:, :pieces]
-        size = np.exp(rng.uniform(math.log(self.noise[0]), math.log(self.noise[1]), (count, 1, 1)))
+        noise = rng.normal(size=(count, -(-pieces // NOISE_PIECES), joints)).repeat(NOISE_PIECES, 1)[:, :pieces]
+        size = np.exp(rng.uniform(math.log(NOISE[0]), math.log(NOISE[1]), (count, 1, 1)))
         changed = values + torch.as_tensor(objective.bound * size * noise)
         return changed.clamp(-objective.bound, objective.bound)
 
@@ -118,7 +111,7 @@ class GaussNewton:
 class Both:
     """Sampling, and Gauss-Newton from its result."""
 
-    sampling: Mppi
+    sampling: Solver
     """The sampling solver."""
 
     def solve(self, objective: Objective, warm: Tensor, propose: Draw, rng: np.random.Generator) -> Solution:
@@ -128,7 +121,7 @@ class Both:
         return polished if polished.cost < found.cost else found
 
 
-def solver_of(name: SolverName, sampling: Mppi) -> Solver:
+def solver_of(name: SolverName, sampling: Solver) -> Solver:
     """Return the solver of a name.
 
     Args:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.control.controller import Controller, ControlState
+from cgwm.pipeline.control.elites import Elites
 from cgwm.pipeline.control.horizon import Horizon, Targets
 from cgwm.pipeline.control.solvers import Mppi, solver_of
 from helpers import fused_host
@@ -62,6 +63,30 @@ def test_one_degree_of_freedom_is_solved_to_its_known_optimum(name, bound: float
     tolerance = 1e-6 if name != "mppi" else 0.02
     assert found.cost - lowest <= tolerance * (1 + lowest)
     assert float(plan.mean()) == pytest.approx(problem.best, abs=0.01 if name == "mppi" else 1e-3)
+
+
+@pytest.mark.parametrize("bound", [1.0, 0.15])
+def test_means_of_the_best_samples_stay_about_the_known_optimum(bound: float) -> None:
+    problem, rng = Sledge(bound), np.random.default_rng(0)
+    plan, means = torch.zeros(10, 1, dtype=torch.float64), []
+    for _ in range(150):
+        found = Elites(16).solve(problem, plan, nothing, rng)
+        assert found.cost <= float(problem.costs(plan[None])) + 1e-12  # the plan before is a sample
+        assert found.values.abs().max() <= bound
+        plan = found.values
+        means.append(float(plan.mean()))
+    assert np.mean(means[50:]) == pytest.approx(problem.best, rel=0.1)
+
+
+def test_changes_of_elites_are_cubics_whose_beginning_is_small() -> None:
+    """Three differences of a cubic are equal; with the plan before at 0 and one sample kept, the result is a sample."""
+    kept = [
+        Elites(12, best=1).solve(Sledge(100.0), torch.full((10, 1), 5.0, dtype=torch.float64), nothing,
+                                 np.random.default_rng(seed)).values[:, 0] for seed in range(20)
+    ]  # fmt: skip
+    values = torch.stack(kept).numpy()
+    np.testing.assert_allclose(np.diff(values, 4), 0.0, atol=1e-9)
+    assert np.abs(values[:, 0] - 5.0).mean() < 0.7 * np.abs(values[:, -1] - 5.0).mean()
 
 
 def test_a_plan_that_is_shifted_says_the_same() -> None:
