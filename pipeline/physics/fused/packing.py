@@ -288,20 +288,32 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
     for free, group in groupby(range(len(world.bodies)), lambda index: world.bodies[index].free):
         rows = [*group]
         if free or others is None:
-            columns += [x for index in rows for x in _free_columns(world.bodies[index], index, state, turn)]
+            weights = world.once(_weights)
+            columns += [
+                x for index in rows for x in _free_columns(world.bodies[index], weights[index], index, state, turn)
+            ]
         else:
             columns.append(others[:, rows[0] : rows[-1] + 1].flatten(1))
     return columns
 
 
-def _free_columns(body: Body, index: int, state: State, turn: Tensor | None) -> list[Tensor]:
-    """Return the columns of a free body: inverse mass and inertia, centre of mass, motion."""
+def _free_columns(body: Body, weight: list[Tensor], index: int, state: State, turn: Tensor | None) -> list[Tensor]:
+    """Return the columns of a free body: those of its weight, and its motion."""
     motion = start(body, *(part[:, index] for part in state.tensors))
-    inverse = torch.linalg.inv(body.inertia).flatten(1)
-    inertia = torch.cat([inverse[:, k : k + 1] for k in (0, 4, 8, 1, 2, 5)], -1)
     moving = (in_frame(turn, x) for x in (motion.velocity, motion.spin))
     pose = in_frame(turn, motion.com), quat_in_frame(turn, motion.quat_wxyz)
-    return [body.mass.reciprocal()[:, None], inertia, body.com, *pose, *moving]
+    return [*weight, *pose, *moving]
+
+
+def _weights(world: World) -> dict[int, list[Tensor]]:
+    """Return by free body the columns of its inverse mass and inertia and its centre of mass."""
+    found = {}
+    for index, body in enumerate(world.bodies):
+        if body.free:
+            inverse = torch.linalg.inv(body.inertia).flatten(1)
+            inertia = torch.cat([inverse[:, k : k + 1] for k in (0, 4, 8, 1, 2, 5)], -1)
+            found[index] = [body.mass.reciprocal()[:, None], inertia, body.com]
+    return found
 
 
 def _other_columns(world: World, state: State, turn: Tensor | None) -> Tensor:
