@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 from ...runtime import kernel_build
 from ..contact_detection import FAR_M, PAIR_SMOOTHING_M
@@ -14,7 +15,7 @@ from ..hull import MOST_PLANES, OVERHANG_M, PARALLEL, SAME_NORMAL, SAME_PLANE_M
 from ..impulse_solver import CONTACT_ONSET_M, LEAST_MOBILITY
 from ..joint_rows import LIMIT_TIME_S
 from ..surface_mesh import FLAT, MESH_CONTACTS, ORDER
-from .tree import Tree
+from .tree import Tree, listed, listed_copies, lists_bytes
 
 THREADS = 32
 """Threads of a block: one warp, so that few environments still spread over all multiprocessors."""
@@ -63,6 +64,7 @@ _NUMBERS: dict[str, float] = {
 _FILES = (
     "arithmetic",  # dual numbers, vectors and rotations, and sums over the threads of an environment
     "surface",  # effects of the contact between one body and the ground: formulas of physics/effects
+    "contact",  # what a contact of a step is
     "chain",  # links of chains and their joints, as read from the table
     "contacts",  # contacts with ground, spheres and hulls: contact_detection, edge_contact, hull, impulse_solver
     "environment",  # what the kernel is given, and the state of an environment read from it
@@ -150,19 +152,22 @@ class Structure:
     @property
     def shared_bytes(self) -> int:
         """Bound on the size of the copy that the threads of an environment share, `Environment` in `kernels`."""
-        tree, bodies, laws, free = self.tree or Tree(), len(self.free), self.law_count, max(1, sum(self.free))
-        links, joints, dofs, depth = len(tree.bodies), len(tree.joint_dofs) + 1, len(tree.dof_above), tree.depth
-        numbers = 32 + 5 * laws + 52 * bodies + 9 * free + 5 * len(self.pairs) + 6 * len(tree.roots) + 6 * depth
-        numbers += 23 * links + 16 * joints + (8 + depth) * dofs + max(13 * links, 6 * bodies + 10 * self.lanes)
-        numbers += max(33 * tree.heavy * links, 6 * depth * links + 6 * (links + free))
+        tree, bodies, free, pairs = self.tree or Tree(), len(self.free), max(1, sum(self.free)), max(1, len(self.pairs))
+        links, joints, dofs, roots = len(tree.bodies), len(tree.joint_dofs) + 1, len(tree.dof_above), len(tree.roots)
         size = (4 if self.single else 8) * (2 if self.dual else 1)
-        flags = 2 * len(self.pairs) + 5 * links + joints + 4 * len(tree.roots) + 4 * free
-        return size * numbers + 8 * self.lanes + 28 * bodies + flags + 64
+        place, mass = 13 * links, tree.heavy * (16 * links + 2 * dofs + joints)
+        kick = mass + max(place, 12 * tree.heavy * links) + 12 * roots + 4 * dofs + joints
+        shown = max(12 * (links + free), (24 + (self.law_count > 1)) * self.lanes)
+        collide = 6 * tree.columns + shown + 11 * self.lanes + 8 + 2 * pairs
+        marks = 2 * pairs + 4 * (bodies + links + free + 4 * self.lanes) + 16
+        lasting = 40 + 5 * self.law_count + 41 * bodies + 23 * free + 3 * links + 8 * joints + dofs * (2 + tree.depth)
+        flags = links + 2 * joints + 4 * roots + 4 * bodies + 128
+        return size * (lasting + max(kick, collide, place + dofs)) + marks + flags
 
     @property
     def block_bytes(self) -> int:
         """Bound on the shared memory of a block of threads."""
-        return self.shared_bytes * (THREADS // self.lanes) + (self.tree or Tree()).list_bytes + 64
+        return self.shared_bytes * (THREADS // self.lanes) + lists_bytes(self._copied_lists()) + 64
 
     def on_lanes(self, lanes: int) -> Structure:
         """Return the structure for a number of threads per environment, or for those that shared memory has room for.
@@ -171,7 +176,7 @@ class Structure:
         one thread, whose copy is in its own memory.
         """
         wanted = replace(self, lanes=lanes)
-        if not wanted.shared or wanted.block_bytes <= SHARED_BYTES:
+        if not wanted.shared or _block_bytes(wanted) <= SHARED_BYTES:
             return wanted
         return self.on_lanes(2 * lanes if lanes < THREADS else 1)
 
@@ -211,9 +216,26 @@ class Structure:
         tree = self.tree or Tree()
         flags = [f"#define {name} {int(value)}" for name, value in (self._flags(host) | _tree_flags(tree)).items()]
         numbers = [f"#define {name} {value!r}" for name, value in _NUMBERS.items()]
-        functions = [_function(name, values) for name, values in (self._lists() | self._tree_lists(tree)).items()]
-        texts = (kernel_file("language"), *functions, *tree.lists(self.shared and not host), *map(kernel_file, _FILES))
+        if self.shared and not host:
+            lists = listed_copies(self._copied_lists())
+        else:
+            lists = listed(tree.lists | self._long_lists())
+        functions = [_function(name, values) for name, values in self._called_lists().items()]
+        texts = (kernel_file("language"), *lists, *functions, *map(kernel_file, _FILES))
         return "\n".join((*flags, *numbers, *texts))
+
+    def _called_lists(self) -> dict[str, list[int]]:
+        """Return the lists that functions look up, by name."""
+        lists = self._lists() | self._tree_lists(self.tree or Tree())
+        return {name: [int(value) for value in values] for name, values in lists.items()}
+
+    def _long_lists(self) -> dict[str, list[int]]:
+        """Return those of them that are arrays in memory, by the name of the array."""
+        return {f"{name}_of": values for name, values in self._called_lists().items() if len(values) > _LONG_LIST}
+
+    def _copied_lists(self) -> dict[str, Sequence[int]]:
+        """Return the lists of which each block of threads has a copy, by name."""
+        return (self.tree or Tree()).lists | self._long_lists()
 
     def _flags(self, host: bool) -> dict[str, int]:
         """Return the constants by name, those of chains aside."""
@@ -221,6 +243,9 @@ class Structure:
         alone = host and self.lanes == 1  # one thread of a CPU, whose arrays lie in its cache
         hulls = paired and any(faces for _, faces, *_ in self.hulls)
         held = not paired and (alone or self._fits_registers)
+        queued = self.shared and not hulls
+        # contacts with ground and surfaces may be two more of a pair than the even share of a lane
+        list_room = self.slots + queued * (1 + 2 * sum(b < 0 for _, b, _ in self.pairs))
         return {
             "HOST": host, "SHARED": self.shared, "SHARED_BYTES": self.shared_bytes, "SINGLE": self.single,
             "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
@@ -232,7 +257,7 @@ class Structure:
             "HALF_SPACE_KIND": HALF_SPACE, "BOX_KIND": BOX, "MESH_KIND": MESH,
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
             "LISTED": paired or alone, "CULLED": alone, "LAWS": self.law_count, "STEP_WIDTH": 2 + 2 * self.law_count,
-            "HULLS": hulls, "QUEUED": self.shared and not hulls,
+            "HULLS": hulls, "QUEUED": queued, "LIST_ROOM": list_room,
             "PATCHES": bool(self.areas),
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
             "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
@@ -242,6 +267,7 @@ class Structure:
         """Return the lists by name."""
         lists: dict[str, Iterable[int]] = {
             "is_free": self.free, "free_number": [sum(self.free[:index]) for index in range(len(self.free))],
+            "free_body": [index for index, moves in enumerate(self.free) if moves] or [0],
             "drive_number": self.drives, "sphere_count": self.spheres,
             "sphere_start": _starts(self.spheres), "pair_a": [a for a, _, _ in self.pairs],
             "pair_b": [b for _, b, _ in self.pairs], "contact_count": [count for _, _, count in self.pairs],
@@ -266,8 +292,13 @@ def _tree_flags(tree: Tree) -> dict[str, int]:
     return {
         "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
         "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy, "LEVELS": tree.levels,
-        "BRANCH_COUNT": len(tree.branches),
+        "BRANCH_COUNT": len(tree.branches), "COLUMNS": tree.columns,
     }  # fmt: skip
+
+
+@cache
+def _block_bytes(structure: Structure) -> int:
+    return structure.block_bytes
 
 
 def kernel_file(name: str) -> str:
@@ -293,13 +324,9 @@ def _starts(counts: Sequence[int]) -> list[int]:
     return [sum(counts[:index]) for index in range(len(counts))]
 
 
-def _function(name: str, values: Iterable[int]) -> str:
+def _function(name: str, values: Sequence[int]) -> str:
     """Return the source of a function that looks up a list, which the compiler resolves for a known index."""
-    values = list(values)
     if len(values) > _LONG_LIST:
-        listed = ", ".join(str(int(value)) for value in values)
-        return f"__device__ static const int {name}_list[] = {{{listed}}};\n" + (
-            f"INLINE int {name}(int i) {{ return {name}_list[i]; }}"
-        )
+        return f"INLINE int {name}(int i) {{ return {name}_of[i]; }}"
     cases = "".join(f"i == {index} ? {int(value)} : " for index, value in enumerate(values))
     return f"INLINE int {name}(int i) {{ return {cases}0; }}"

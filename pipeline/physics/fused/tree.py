@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate
 
 import torch
@@ -21,6 +22,8 @@ LINK_COLUMNS, JOINT_COLUMNS, COMMAND_WIDTH = 20, 9, 14
 command: the time of its knot and five coefficients of two joints."""
 _NUMBERS = ("lower", "upper", "stiffness", "damping", "armature", "friction", "torque_limit")
 _KINDS = {"hinge": 2, "slide": 3, "fixed": 4}
+_SIZES = {"signed char": 1, "short": 2, "int": 4}
+"""Types of the numbers of lists that a block of threads copies, and their sizes in bytes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +67,11 @@ class Tree:
         return max((len(row) for row in self.above), default=0)
 
     @property
+    def columns(self) -> int:
+        """Number of pairs of a link and a coordinate that moves it."""
+        return sum(map(len, self.above))
+
+    @property
     def table_width(self) -> int:
         """Number of columns."""
         return LINK_COLUMNS * len(self.bodies) + JOINT_COLUMNS * len(self.joint_dofs)
@@ -102,7 +110,8 @@ class Tree:
         """Return rows of numbers by the name of the list of their starts, each with the name of the list of them all.
 
         Links by level, children of each link from the last to the first, coordinates by the number of those above,
-        coordinates below each one, and moving joints by branch.
+        coordinates below each one, moving joints by branch, each link once for each coordinate that moves it, and links
+        by these coordinates.
         """
         links, dofs = range(len(self.bodies)), range(len(self.dof_links))
         levels = [[k for k in links if self._level(k) == level] for level in range(self.levels)]
@@ -113,39 +122,15 @@ class Tree:
             "level_start": ("level_link", levels), "child_start": ("link_child", children),
             "rank_start": ("rank_dof", ranks), "below_start": ("dof_below", below),
             "branch_start": ("branch_joint", self.branches),
+            "column_start": ("column_link", [[link] * len(self.above[link]) for link in links]),
+            "moved_start": ("moved_link", [[k for k in links if dof in self.above[k]] for dof in dofs]),
         }  # fmt: skip
 
-    @property
-    def list_bytes(self) -> int:
-        """Size of the lists of constants where each block of threads has a copy."""
-        return 2 * sum(max(1, len(values)) for values in self._lists().values())
-
-    def lists(self, copied: bool) -> list[str]:
-        """Return the source of the lists of constants, and of their copies in the memory of a block of threads.
-
-        Args:
-            copied: Whether the names are those of the copies, which `copy_lists` makes: on a GPU, where one place of a
-                list gives the next one's, the memory of a block answers sooner.
-        """
+    @cached_property
+    def lists(self) -> dict[str, Sequence[int]]:
+        """The lists of constants by name; none without links."""
         if not self.bodies:
-            return []
-        lists = {name: list(values) or [0] for name, values in self._lists().items()}
-        kind, ending = ("short", "_list") if copied else ("int", "")
-        sources = [
-            f"__device__ static const {kind} {name}{ending}[] = {{{', '.join(map(str, values))}}};"
-            for name, values in lists.items()
-        ]
-        if not copied:
-            return sources
-        sources += [f"__shared__ static short {name}[{len(values)}];" for name, values in lists.items()]
-        copies = [
-            f"    KEEP_LOOP for (int i = threadIdx.x; i < {len(values)}; i += THREADS) {name}[i] = {name}_list[i];"
-            for name, values in lists.items()
-        ]
-        return [*sources, "INLINE void copy_lists() {", *copies, "    __syncwarp(0xffffffffu);", "}"]
-
-    def _lists(self) -> dict[str, Sequence[int]]:
-        """Return the lists of constants by name."""
+            return {}
         depth = self.depth
         padded = {
             name: [k for row in rows for k in (*row, *[0] * (depth - len(row)))]
@@ -155,7 +140,7 @@ class Tree:
             "link_body": self.bodies, "link_parent": self.parents, "link_kind": self.kinds, "link_dof": self.dofs,
             "link_joint": self.joints, "link_depth": [len(row) for row in self.above],
             "link_root": [self._root(link) for link in range(len(self.bodies))], "dof_link": self.dof_links,
-            "link_light": self.light,
+            "link_light": self.light, "dof_joint": [self.joints[link] for link in self.dof_links],
             "dof_depth": [len(row) for row in self.dof_above], "joint_dof": self.joint_dofs, "chain_root": self.roots,
             "chain_joint": self.firsts, "chain_joints": self.counts, "chain_command": self.commands, **padded,
             "link_chain": [self.roots.index(self._root(link)) for link in range(len(self.bodies))],
@@ -292,3 +277,37 @@ def _rows(command: JointCommand) -> tuple[Tensor, Tensor]:
     padding = torch.zeros_like(pairs[..., : COMMAND_WIDTH - 1 - pairs.shape[-1]])
     rows = torch.cat((time, pairs, padding), -1).flatten(1, 2)
     return rows, torch.full((1,), knots - 1, device=times.device)
+
+
+def lists_bytes(lists: Mapping[str, Sequence[int]]) -> int:
+    """Return the size of the copies of lists in the memory of a block, up to 3 bytes for the start of each."""
+    return sum(_SIZES[_kind(values)] * max(1, len(values)) + 3 for values in lists.values())
+
+
+def listed(lists: Mapping[str, Sequence[int]]) -> list[str]:
+    """Return the source of lists of constants by name."""
+    return [_list_source("int", name, values) for name, values in lists.items()]
+
+
+def listed_copies(lists: Mapping[str, Sequence[int]]) -> list[str]:
+    """Return the source of lists whose names are those of copies in the memory of a block, made by `copy_lists`.
+
+    On a GPU, where a place of one list gives that of the next one, the memory of a block answers sooner.
+    """
+    found = [_list_source(_kind(values), f"{name}_list", values) for name, values in lists.items()]
+    found += [f"__shared__ static {_kind(values)} {name}[{max(1, len(values))}];" for name, values in lists.items()]
+    copies = [
+        f"    KEEP_LOOP for (int i = threadIdx.x; i < {len(values)}; i += THREADS) {name}[i] = {name}_list[i];"
+        for name, values in lists.items()
+    ]
+    return [*found, "INLINE void copy_lists() {", *copies, "    __syncwarp(0xffffffffu);", "}"]
+
+
+def _list_source(kind: str, name: str, values: Sequence[int]) -> str:
+    return f"__device__ static const {kind} {name}[] = {{{', '.join(str(int(value)) for value in values or [0])}}};"
+
+
+def _kind(values: Sequence[int]) -> str:
+    """Return the smallest type that has room for numbers."""
+    most = max((max(value, -1 - value) for value in map(int, values)), default=0)
+    return "signed char" if most < 1 << 7 else "short" if most < 1 << 15 else "int"

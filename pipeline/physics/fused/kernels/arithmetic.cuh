@@ -108,6 +108,10 @@ __device__ inline Number size(Vec a) {
     return root(x * x + y * y + z * z);
 }
 
+struct Velocities {  // of a body
+    Vec velocity, omega;
+};
+
 struct Quat {
     Real w, x, y, z;
 };
@@ -247,6 +251,27 @@ struct Lanes {
         return __any_sync(FULL, mine);
 #endif
     }
+    // Sum of the numbers of the lanes before this one, and of all.
+    __device__ int before(int mine, int& all) const {
+        int sum = mine;
+#if LANES > 1
+#pragma unroll
+        for (int apart = 1; apart < LANES; apart *= 2) {
+            const int other = from(sum, (lane - apart) & (LANES - 1));
+            if (lane >= apart) sum += other;
+        }
+#endif
+        all = from(sum, LANES - 1);
+        return sum - mine;
+    }
+    // Adds one to a number that other lanes may raise at the same time.
+    __device__ static void count_up(int& number) {
+#if HOST
+        number++;
+#else
+        atomicAdd(&number, 1);
+#endif
+    }
     __device__ int from(int mine, int source) const {
 #if LANES == 1
         return mine;
@@ -303,6 +328,7 @@ struct Lanes {
 // of one side.
 #if QUEUED
 __device__ inline int owned(const Lanes& lanes, int group) { return group * LANES + (lanes.lane + group) % LANES; }
+__device__ inline int owner(int contact) { return (contact - contact / LANES + LANES * CONTACTS) % LANES; }
 #define EACH_OWNED(lanes, start, count, k)                                                    \
     KEEP_LOOP for (int group = (start) / LANES, k; group * LANES < (start) + (count); group++) \
         if ((k = owned(lanes, group) - (start)) >= 0 && k < (count))

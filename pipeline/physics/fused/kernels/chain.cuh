@@ -3,8 +3,9 @@
 // The lists of the structure: link_body, link_parent (-1: root), link_kind (0: root that is fixed or driven, 1: free
 // root, 2: hinge, 3: slide, 4: fixed joint), link_light (1: without mass, fixed to another, carries only such), link_dof
 // (first coordinate of its own, -1: none), link_depth (coordinates that move it) and link_above (these, DEPTH a link);
-// dof_link, dof_depth, dof_above (a coordinate and those above it); joint_dof; chain_root (a link), chain_joint (its
-// first), chain_joints, chain_command (-1: none).
+// column_start (place of its first coordinate among those of all links) and column_link; dof_link, dof_joint (-1: none),
+// dof_depth, dof_above (a coordinate and those above it); joint_dof; chain_root (a link), chain_joint (its first),
+// chain_joints, chain_command (-1: none).
 struct Joint {
     Vec position, axis;  // origin in the parent's frame at value 0, axis in the link's
     Quat quat;
@@ -16,6 +17,21 @@ struct Joint {
 struct Servo {
     Real lower, upper, stiffness, damping, armature, friction, torque_limit;
 };
+
+#if SHARED
+// Numbers of the table, which are read where they are needed: there is no room for copies of them.
+struct Joints {
+    Input table;
+    long long first;
+    INLINE Joint operator[](int l) const;
+};
+
+struct Servos {
+    Input table;
+    long long first;
+    INLINE Servo operator[](int j) const;
+};
+#endif
 
 struct Column {  // velocity of a link's origin and its angular velocity by one mass-weighted coordinate
     Vec linear, turning;
@@ -29,38 +45,17 @@ struct Spatial {  // angular and linear part, about the root's origin
 struct Configuration {
     Spatial joints[LINKS];
 #if HEAVY
+    Real masses[LINKS];
     Vec coms[LINKS];
     Sym inertias[LINKS];
 #endif
 };
 
 #if SHARED
-// Where the lanes of an environment work together on the motion of the chains.
-struct PlaceRoom {  // in `kick` and `spread`
+// Where the lanes of an environment work together, by parts of a step, which follow one another.
+struct PlaceRoom {
     Vec positions[LINKS], linear[LINKS], angular[LINKS];
     Quat quats[LINKS];
-};
-
-struct ContactRoom {  // where each lane shows a contact to the others
-    Vec first[LANES], second[LANES], third[LANES];
-    Real weight[LANES];
-    int bodies[LANES];  // as `bodies_of`; -1 where the lane has none
-};
-
-struct FreeRoom {  // in `collide`
-    Vec free_velocities[BODIES], free_omegas[BODIES];
-    ContactRoom contacts;
-};
-
-struct ChainRoom {
-    union {
-        PlaceRoom place;
-        FreeRoom free;
-    };
-    Vec lift[CHAINS], twist[CHAINS];
-    Real first[DOFS], own[DOFS], kept[DOFS], bias[DOFS], mean[DOFS], y[DOFS];
-    Real halfway[JOINTS + 1], moving[JOINTS + 1];
-    Column single[DEPTH];
 };
 
 #if HEAVY
@@ -71,79 +66,142 @@ struct MassRoom {  // in `add_mass`
 };
 
 struct ForceRoom {  // in `bias_of`
-    Spatial velocity[LINKS], change[LINKS], force_on[LINKS];
+    Spatial velocity[LINKS], force_on[LINKS];
 };
+#endif
 
-struct KickRoom {
+struct KickRoom {  // in `kick`
+#if HEAVY
     Configuration at[1];
     union {
         MassRoom mass;
         ForceRoom force;
+        PlaceRoom place;
     };
+    Real bias[DOFS], mean[DOFS], halfway[JOINTS + 1];
+#else
+    PlaceRoom place;
+#endif
+    Vec lift[CHAINS], twist[CHAINS], root_linear[CHAINS], root_angular[CHAINS];
+    Real first[DOFS], own[DOFS], kept[DOFS], y[DOFS], moving[JOINTS + 1];
+};
+
+struct ContactRoom {  // where each lane shows a contact to the others
+    Vec first[LANES], second[LANES], third[LANES];
+    Real weight[LANES];
+    int bodies[LANES];  // as `bodies_of`; -1 where the lane has none
+#if RECORD && LAWS > 1
+    Real friction[LANES];
+#endif
+};
+
+#if QUEUED  // see `make_queued`
+const int WAITING = 4 * LANES;
+struct QueueRoom {  // where lanes leave slots of which another lane makes the contact
+    int slots[WAITING];
+    Vec before[WAITING];  // its impulse in the previous step
+};
+
+struct MoveRoom {  // where lanes leave contacts for other lanes
+    Contact contacts[LANES];
+    Real weights[LANES];
 };
 #endif
+
+struct CollideRoom {  // in `collide`
+    Column columns[COLUMNS + 1];
+    union {
+        struct {
+            Vec pushes[LINKS + FREES], moments[LINKS + FREES];  // on links and free bodies, by the contacts
+            Velocities free[LINKS + FREES];                     // of the same without contact
+        };
+#if QUEUED
+        QueueRoom queue;
+        MoveRoom moved;
+#endif
+    };
+    ContactRoom contacts;
+    Number limits[PAIR_ROOM], nears[PAIR_ROOM];  // see `Reach`
+    bool near[PAIR_ROOM], touched[PAIR_ROOM];    // pairs that may touch, and those that do
+    int groups[BODIES];
+    int reached[LINKS + FREES], reached_count;  // links that are known, then LINKS + numbers of the free bodies
+};
+
+struct SettleRoom {  // in `settle` and `spread`
+    PlaceRoom place;
+    Real first[DOFS];
+};
 #endif
 
 struct Chain {
+#if SHARED
+    Joints joints;
+    Servos servos;
+#else
     Joint joints[LINKS];
     Servo servos[JOINTS + 1];
+#endif
     Real values[JOINTS + 1], speeds[JOINTS + 1];
     Real impulses[3 * JOINTS + 1];  // of the previous step: lower limit, upper limit, dry friction
     int cursors[CHAINS];
     // of the step
     Real speed[DOFS], inverse[DOFS * DEPTH];  // without contact; rows of the inverse of L, A = L^T L
     Real moved[DOFS];                         // what impulses change, mass-weighted
-    Real lower[JOINTS + 1], upper[JOINTS + 1];
+    Real lower[JOINTS + 1], upper[JOINTS + 1], most[JOINTS + 1];  // speeds of the limits, impulse of dry friction
     Vec axes[LINKS];
 #if SHARED
+    Real free_masses[FREES];  // inverse, and of inertia in world axes
+    Sym free_inertias[FREES];
     union {
-#if HEAVY
-        KickRoom before;
-#endif
-        struct {  // when the motion without contact is known
-            Column columns[LINKS * DEPTH];
-            Vec pushes[LINKS + FREES], moments[LINKS + FREES];  // on the reached bodies, by the contacts
-        };
-    };
+        KickRoom kick;
+        CollideRoom collide;
+        SettleRoom settle;
+    } room;
 #else
     Column columns[LINKS * DEPTH];
 #endif
     bool known[LINKS], active;
-#if SHARED
-    int reached[LINKS + FREES], reached_links, reached_count;  // bodies of the links that are known, and free ones
-#endif
-    bool acts[JOINTS + 1];
-#if SHARED
-    ChainRoom room;
-#endif
+    bool acts[JOINTS + 1], busy[JOINTS + 1];  // joints that may have impulses, and those that may in this step
 };
+
+INLINE Joint joint_at(const Input& table, long long at) {
+    Quat quat = {table.at(at + 3), table.at(at + 4), table.at(at + 5), table.at(at + 6)};
+    Sym inertia = {table.at(at + 11), table.at(at + 12), table.at(at + 13),
+                   table.at(at + 14), table.at(at + 15), table.at(at + 16)};
+    Joint joint = {table.vector(at), table.vector(at + 7), quat, table.at(at + 10), inertia, table.vector(at + 17)};
+    return joint;
+}
+
+INLINE Servo servo_at(const Input& table, long long at) {
+    Servo servo = {table.at(at),     table.at(at + 1), table.at(at + 2), table.at(at + 3),
+                   table.at(at + 4), table.at(at + 5), table.at(at + 6)};
+    return servo;
+}
+
+#if SHARED
+INLINE Joint Joints::operator[](int l) const { return joint_at(table, first + 20LL * l); }
+INLINE Servo Servos::operator[](int j) const { return servo_at(table, first + 9LL * j); }
+#endif
 
 // Reads the chains from the column `first` of the table on, and returns the column after them.
 INLINE long long load_chain(const Input& table, long long first, const Lanes& lanes, Chain& chain) {
-    DIVIDED(lanes, l, LINKS) {
-        long long at = first + 20 * l;
-        Joint& j = chain.joints[l];
-        j.position = table.vector(at);
-        Quat quat = {table.at(at + 3), table.at(at + 4), table.at(at + 5), table.at(at + 6)};
-        j.quat = quat;
-        j.axis = table.vector(at + 7);
-        j.mass = table.at(at + 10);
-        Sym inertia = {table.at(at + 11), table.at(at + 12), table.at(at + 13),
-                       table.at(at + 14), table.at(at + 15), table.at(at + 16)};
-        j.inertia = inertia;
-        j.com = table.vector(at + 17);
+#if SHARED
+    if (lanes.writes()) {
+        Joints joints = {table, first};
+        Servos servos = {table, first + 20 * LINKS};
+        chain.joints = joints;
+        chain.servos = servos;
     }
+#else
+    for (int l = 0; l < LINKS; l++) chain.joints[l] = joint_at(table, first + 20 * l);
+#endif
     first += 20 * LINKS;
     DIVIDED(lanes, k, JOINTS) {
         long long at = first + 9 * k;
-        Servo& s = chain.servos[k];
-        s.lower = table.at(at);
-        s.upper = table.at(at + 1);
-        s.stiffness = table.at(at + 2);
-        s.damping = table.at(at + 3);
-        s.armature = table.at(at + 4);
-        s.friction = table.at(at + 5);
-        s.torque_limit = table.at(at + 6);
+        Servo s = servo_at(table, at);
+#if !SHARED
+        chain.servos[k] = s;
+#endif
         chain.values[k] = table.at(at + 7);
         chain.speeds[k] = table.at(at + 8);
         for (int i = 0; i < 3; i++) chain.impulses[3 * k + i] = Real(0);

@@ -9,7 +9,7 @@ INLINE void place_links(const Chain& chain, const Lanes& lanes, const Real* valu
     DIVIDED(lanes, l, LINKS) {  // each in its parent's frame
         int kind = link_kind[l];
         if (link_parent[l] < 0) continue;
-        const Joint& j = chain.joints[l];
+        const Joint j = chain.joints[l];
         positions[l] = j.position;
         quats[l] = j.quat;
         if (kind == 2) quats[l] = multiply(j.quat, quat_exp(values[link_joint[l]] * j.axis));
@@ -51,7 +51,7 @@ INLINE Spatial column_of(const Configuration& at, int dof) {
 INLINE void configure(const Chain& chain, const Lanes& lanes, const Vec* positions, const Quat* quats,
                       Configuration& at) {
     DIVIDED(lanes, l, LINKS) {
-        const Joint& j = chain.joints[l];
+        const Joint j = chain.joints[l];
         Vec origin = positions[l] - positions[link_root[l]];
         Mat R = matrix(quats[l]);
         Vec axis = R * j.axis;
@@ -59,6 +59,7 @@ INLINE void configure(const Chain& chain, const Lanes& lanes, const Vec* positio
         at.joints[l] = link_kind[l] == 2 ? turning : moving;
 #if HEAVY
         if (link_light[l]) continue;
+        at.masses[l] = j.mass;
         at.coms[l] = origin + R * j.com;
         at.inertias[l] = turned(R, j.inertia);
 #endif
@@ -67,8 +68,8 @@ INLINE void configure(const Chain& chain, const Lanes& lanes, const Vec* positio
 }
 
 #if HEAVY
-INLINE Spatial momentum(const Chain& chain, const Configuration& at, int l, const Spatial& motion) {
-    Vec c = at.coms[l], linear = chain.joints[l].mass * (motion.moving + cross(motion.turning, c));
+INLINE Spatial momentum(const Configuration& at, int l, const Spatial& motion) {
+    Vec c = at.coms[l], linear = at.masses[l] * (motion.moving + cross(motion.turning, c));
     Spatial p = {at.inertias[l] * motion.turning + cross(c, linear), linear};
     return p;
 }
@@ -76,13 +77,13 @@ INLINE Spatial momentum(const Chain& chain, const Configuration& at, int l, cons
 // Adds the mass matrix to A, by composite bodies: mass, first moment and inertia of each link and all that it carries,
 // about the root's origin.
 INLINE void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, Real* A) {
-    ROOM(Real, mass, LINKS, chain.before.mass);
-    ROOM(Vec, moment, LINKS, chain.before.mass);
-    ROOM(Sym, inertia, LINKS, chain.before.mass);
+    ROOM(Real, mass, LINKS, chain.room.kick.mass);
+    ROOM(Vec, moment, LINKS, chain.room.kick.mass);
+    ROOM(Sym, inertia, LINKS, chain.room.kick.mass);
     DIVIDED(lanes, l, LINKS) {
         if (link_light[l]) continue;
         Vec c = at.coms[l];
-        mass[l] = chain.joints[l].mass;
+        mass[l] = at.masses[l];
         moment[l] = mass[l] * c;
         Sym S = at.inertias[l];
         Real m = mass[l];
@@ -113,17 +114,17 @@ INLINE void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, 
         Spatial S = column_of(at, d);
         Spatial F = {inertia[l] * S.turning + cross(moment[l], S.moving),
                      mass[l] * S.moving + cross(S.turning, moment[l])};
-        INNER for (int k = 0; k < dof_depth[d]; k++) A[d * DEPTH + k] += along(column_of(at, dof_above[d * DEPTH + k]), F);
+        EACH_ABOVE(k, dof_depth[d]) A[d * DEPTH + k] += along(column_of(at, dof_above[d * DEPTH + k]), F);
     }
     lanes.sync();
 }
 
 #if EFFECTS
 // Force and its moment about the root's origin that effects exert on a link; see `apply` for free bodies.
-INLINE Spatial pushed(const Wrenches& w, const Chain& chain, const Configuration& at, int l, const Spatial& motion) {
+INLINE Spatial pushed(const Wrenches& w, const Configuration& at, int l, const Spatial& motion) {
     Vec c = at.coms[l], omega = motion.turning, u = motion.moving + cross(omega, c) - w.wind;
     Real drag = w.linear_drag + w.quadratic_drag * root(dot(u, u) + Real(Number(1e-24)));
-    Vec force = chain.joints[l].mass * (w.acceleration - drag * u + w.magnus * cross(omega, u));
+    Vec force = at.masses[l] * (w.acceleration - drag * u + w.magnus * cross(omega, u));
     Vec torque = -(w.spin_damping * (at.inertias[l] * omega));
 #if TWISTED
     torque = torque + at.inertias[l] * w.twist;
@@ -138,19 +139,20 @@ INLINE Spatial pushed(const Wrenches& w, const Chain& chain, const Configuration
 INLINE void bias_of(Environment& env, const Lanes& lanes, const Configuration& at, const Vec* root_linear,
                     const Vec* root_angular, const Vec* root_lift, const Vec* root_twist, const Real* speed, Real* bias) {
     Chain& chain = env.chain;
-    ROOM(Spatial, velocity, LINKS, chain.before.force);
-    ROOM(Spatial, change, LINKS, chain.before.force);
-    ROOM(Spatial, force_on, LINKS, chain.before.force);
+    ROOM(Spatial, velocity, LINKS, chain.room.kick.force);
+    ROOM(Spatial, force_on, LINKS, chain.room.kick.force);
+    Spatial* const change = force_on;  // of the velocity, until the force is known
     DOWN_LINKS(lanes, l) {
         int parent = link_parent[l], dof = link_dof[l];
         if (link_light[l]) continue;
         if (parent < 0) {
-            Vec v = root_linear[l], w = root_angular[l];
+            const int c = link_chain[l];
+            Vec v = root_linear[c], w = root_angular[c];
             if (link_kind[l] == 1) {
                 v = vec(speed[dof], speed[dof + 1], speed[dof + 2]);
                 w = vec(speed[dof + 3], speed[dof + 4], speed[dof + 5]);
             }
-            Spatial V = {w, v}, A = {root_twist[link_chain[l]], root_lift[link_chain[l]] - cross(w, v)};
+            Spatial V = {w, v}, A = {root_twist[c], root_lift[c] - cross(w, v)};
             velocity[l] = V;
             change[l] = A;
         } else {
@@ -168,12 +170,12 @@ INLINE void bias_of(Environment& env, const Lanes& lanes, const Configuration& a
     }
     DIVIDED(lanes, l, LINKS) {
         if (link_light[l]) continue;
-        Spatial P = momentum(chain, at, l, velocity[l]), F = momentum(chain, at, l, change[l]);
+        Spatial P = momentum(at, l, velocity[l]), F = momentum(at, l, change[l]);
         Vec w = velocity[l].turning, v = velocity[l].moving;
         force_on[l].turning = F.turning + cross(w, P.turning) + cross(v, P.moving);
         force_on[l].moving = F.moving + cross(w, P.moving);
 #if EFFECTS
-        Spatial push = pushed(env.wrenches, chain, at, l, velocity[l]);
+        Spatial push = pushed(env.wrenches, at, l, velocity[l]);
         force_on[l].turning = force_on[l].turning - push.turning;
         force_on[l].moving = force_on[l].moving - push.moving;
 #endif
@@ -208,18 +210,18 @@ INLINE void factor(const Lanes& lanes, Real* A) {
         Real* row = A + d * DEPTH;
         INNER for (int i = below_start[d + 1] - 1; i >= below_start[d]; i--) {
             const Real* from = A + dof_below[i] * DEPTH;
-            INNER for (int k = 0; k <= last; k++) row[k] -= from[last] * from[k];
+            EACH_ABOVE(k, last + 1) row[k] -= from[last] * from[k];
         }
         Real over = inverse_root(row[last]);
         row[last] = over;  // 1 / L_dd
-        INNER for (int k = 0; k < last; k++) row[k] = over * row[k];
+        EACH_ABOVE(k, last) row[k] = over * row[k];
     }
     DOWN_DOFS(lanes, d) {
         int last = dof_depth[d] - 1;
         Real* row = A + d * DEPTH;
         INNER for (int k = 0; k < last; k++) {
             Real sum = Real(0);
-            INNER for (int i = k; i < last; i++) sum += row[i] * A[dof_above[d * DEPTH + i] * DEPTH + k];
+            SOME for (int i = k; i < last; i++) sum += row[i] * A[dof_above[d * DEPTH + i] * DEPTH + k];
             row[k] = -(row[last] * sum);
         }
     }
@@ -228,11 +230,11 @@ INLINE void factor(const Lanes& lanes, Real* A) {
 // x = inverse(A) b
 INLINE void solve_mass(Chain& chain, const Lanes& lanes, const Real* b, Real* x) {
     const Real* inverse = chain.inverse;
-    ROOM(Real, y, DOFS, chain.room);
+    ROOM(Real, y, DOFS, chain.room.kick);
     DIVIDED(lanes, d, DOFS) {
         int last = dof_depth[d] - 1;
         Real sum = inverse[d * DEPTH + last] * b[d];
-        INNER for (int i = below_start[d]; i < below_start[d + 1]; i++) {
+        SOME for (int i = below_start[d]; i < below_start[d + 1]; i++) {
             sum += inverse[dof_below[i] * DEPTH + last] * b[dof_below[i]];
         }
         y[d] = sum;
@@ -240,7 +242,7 @@ INLINE void solve_mass(Chain& chain, const Lanes& lanes, const Real* b, Real* x)
     lanes.sync();
     DIVIDED(lanes, d, DOFS) {
         Real sum = Real(0);
-        INNER for (int k = 0; k < dof_depth[d]; k++) sum += inverse[d * DEPTH + k] * y[dof_above[d * DEPTH + k]];
+        EACH_ABOVE(k, dof_depth[d]) sum += inverse[d * DEPTH + k] * y[dof_above[d * DEPTH + k]];
         x[d] = sum;
     }
     lanes.sync();
@@ -286,17 +288,19 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
                  Motion* motions) {
     Chain& chain = env.chain;
     Real h = env.laws[0].step_s, half_h = Number(0.5) * h;
-    ROOM(Vec, positions, LINKS, chain.room.place);
-    ROOM(Vec, linear, LINKS, chain.room.place);
-    ROOM(Vec, angular, LINKS, chain.room.place);
-    ROOM(Vec, lift, CHAINS, chain.room);
-    ROOM(Vec, twist, CHAINS, chain.room);
-    ROOM(Quat, quats, LINKS, chain.room.place);
-    ROOM(Real, first, DOFS, chain.room);
-    ROOM(Real, own, DOFS, chain.room);
-    ROOM(Real, kept, DOFS, chain.room);
+    ROOM(Vec, positions, LINKS, chain.room.kick.place);
+    ROOM(Vec, linear, LINKS, chain.room.kick.place);
+    ROOM(Vec, angular, LINKS, chain.room.kick.place);
+    ROOM(Quat, quats, LINKS, chain.room.kick.place);
+    ROOM(Vec, lift, CHAINS, chain.room.kick);
+    ROOM(Vec, twist, CHAINS, chain.room.kick);
+    ROOM(Vec, root_linear, CHAINS, chain.room.kick);
+    ROOM(Vec, root_angular, CHAINS, chain.room.kick);
+    ROOM(Real, first, DOFS, chain.room.kick);
+    ROOM(Real, own, DOFS, chain.room.kick);
+    ROOM(Real, kept, DOFS, chain.room.kick);
 #if HEAVY
-    ROOM(Real, halfway, JOINTS + 1, chain.room);
+    ROOM(Real, halfway, JOINTS + 1, chain.room.kick);
 #endif
     DIVIDED(lanes, d, DOFS) own[d] = kept[d] = Real(0);
     lanes.sync();
@@ -305,8 +309,8 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
         Body& root = env.bodies[b];
         lift[c] = -env.gravity;
         twist[c] = none();
-        linear[l] = root.velocity;
-        angular[l] = root.spin;
+        root_linear[c] = root.velocity;
+        root_angular[c] = root.spin;
 #if DRIVEN
         if (drive_number(b) >= 0) {
             Body now = root;
@@ -328,7 +332,7 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
     lanes.sync();
     DIVIDED(lanes, j, JOINTS) {
         int d = joint_dof[j], c = joint_chain[j];
-        const Servo& s = chain.servos[j];
+        const Servo s = chain.servos[j];
         first[d] = chain.speeds[j];
 #if HEAVY
         halfway[j] = chain.values[j] + half_h * chain.speeds[j];
@@ -355,15 +359,15 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
     lanes.sync();
 #if HEAVY
     place_links(chain, lanes, halfway, positions, quats);
-    ROOM(Configuration, at, 1, chain.before);
+    ROOM(Configuration, at, 1, chain.room.kick);
     configure(chain, lanes, positions, quats, at[0]);
     add_mass(chain, lanes, at[0], A);
 #endif
 #if HEAVY
     DIVIDED(lanes, d, DOFS) {
         int last = dof_depth[d] - 1;
-        INNER for (int k = 0; k <= last; k++) kept[d] += A[d * DEPTH + k] * first[dof_above[d * DEPTH + k]];
-        INNER for (int i = below_start[d]; i < below_start[d + 1]; i++) {
+        EACH_ABOVE(k, last + 1) kept[d] += A[d * DEPTH + k] * first[dof_above[d * DEPTH + k]];
+        SOME for (int i = below_start[d]; i < below_start[d + 1]; i++) {
             kept[d] += A[dof_below[i] * DEPTH + last] * first[dof_below[i]];
         }
     }
@@ -373,13 +377,13 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
     lanes.sync();
     factor(lanes, A);
 #if HEAVY
-    ROOM(Real, bias, DOFS, chain.room);
-    ROOM(Real, mean, DOFS, chain.room);
+    ROOM(Real, bias, DOFS, chain.room.kick);
+    ROOM(Real, mean, DOFS, chain.room.kick);
     DIVIDED(lanes, d, DOFS) mean[d] = first[d];
     lanes.sync();
     KEEP_LOOP
     for (int pass = 0; pass < 2; pass++) {
-        bias_of(env, lanes, at[0], linear, angular, lift, twist, mean, bias);
+        bias_of(env, lanes, at[0], root_linear, root_angular, lift, twist, mean, bias);
         DIVIDED(lanes, d, DOFS) bias[d] = kept[d] - h * bias[d];
         lanes.sync();
         solve_mass(chain, lanes, bias, chain.speed);
@@ -396,13 +400,12 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
         chain.axes[l] = rotations[b] * chain.joints[l].axis;
         chain.known[l] = false;
     }
-    ROOM(Real, moving, JOINTS + 1, chain.room);
+    ROOM(Real, moving, JOINTS + 1, chain.room.kick);
     DIVIDED(lanes, j, JOINTS) moving[j] = chain.speed[joint_dof[j]];
     DIVIDED(lanes, c, CHAINS) {
         int l = chain_root[c], d = link_dof[l];
-        if (d < 0) continue;
-        linear[l] = vec(chain.speed[d], chain.speed[d + 1], chain.speed[d + 2]);
-        angular[l] = vec(chain.speed[d + 3], chain.speed[d + 4], chain.speed[d + 5]);
+        linear[l] = d < 0 ? root_linear[c] : vec(chain.speed[d], chain.speed[d + 1], chain.speed[d + 2]);
+        angular[l] = d < 0 ? root_angular[c] : vec(chain.speed[d + 3], chain.speed[d + 4], chain.speed[d + 5]);
     }
     lanes.sync();
     move_links(lanes, chain.axes, positions, moving, linear, angular);
@@ -410,8 +413,10 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
         int b = link_body[l];
         motions[b].velocity = linear[l];
         motions[b].omega = angular[l];
+#if !SHARED
         motions[b].columns = chain.columns + l * DEPTH;
         motions[b].depth = 0;
+#endif
     }
     DIVIDED(lanes, d, DOFS) chain.moved[d] = Real(0);
     // limits: critically damped, with a natural time of LIMIT_TIME_S; see `coefficients`
@@ -421,20 +426,86 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
     if (lanes.writes()) chain.active = false;
     lanes.sync();
     DIVIDED(lanes, j, JOINTS) {
+        chain.busy[j] = false;
         if (!chain.acts[j]) continue;
-        const Servo& s = chain.servos[j];
+        const Servo s = chain.servos[j];
         chain.lower[j] = limit_target(chain.values[j] - s.lower, moving[j], h, stiffness, damping);
         chain.upper[j] = limit_target(s.upper - chain.values[j], -moving[j], h, stiffness, damping);
         bool warm = false;
         INNER for (int i = 0; i < 3; i++) warm = warm || plain(chain.impulses[3 * j + i]) != Number(0);
+        chain.most[j] = h * s.friction;
         if (warm || plain(s.friction) > Number(0) || plain(chain.lower[j]) > Number(-1e29) ||
             plain(chain.upper[j]) > Number(-1e29)) {
-            chain.active = true;
+            chain.busy[j] = chain.active = true;
         }
     }
     lanes.sync();
 }
 
+// Velocity of a point that a link carries, and its angular velocity, by one coordinate alone.
+INLINE Column single_column(const Chain& chain, const Body* bodies, int d, Vec point) {
+    int from = dof_link[d], kind = link_kind[from];
+    Vec arm = point - bodies[link_body[from]].position;
+    if (kind == 1) {
+        int k = d - link_dof[from];
+        Column linear = {unit_vector(k), none()}, turning = {cross(unit_vector(k - 3), arm), unit_vector(k - 3)};
+        return k < 3 ? linear : turning;
+    }
+    Vec axis = chain.axes[from];
+    Column hinge = {cross(axis, arm), axis}, slide = {axis, none()};
+    return kind == 2 ? hinge : slide;
+}
+
+#if SHARED
+// Makes the columns of all links that contact may move, at the pose of the start of the step.
+INLINE void reveal_links(Chain& chain, const Lanes& lanes, const Body* bodies) {
+    DIVIDED(lanes, column, COLUMNS) {
+        const int l = column_link[column], k = column - column_start[l], depth = link_depth[l];
+        if (!chain.known[l]) continue;
+        const Vec origin = bodies[link_body[l]].position;
+        Column sum = {none(), none()};
+        INNER for (int i = k; i < depth; i++) {
+            const int d = link_above[l * DEPTH + i];
+            const Column single = single_column(chain, bodies, d, origin);
+            Real part = chain.inverse[d * DEPTH + k];
+            sum.linear = sum.linear + part * single.linear;
+            sum.turning = sum.turning + part * single.turning;
+        }
+        chain.room.collide.columns[column] = sum;
+    }
+    lanes.sync();
+}
+
+// Sum of the impulses of the joint of a coordinate; of those of a free root there is none.
+INLINE Real joint_impulse(const Chain& chain, int d) {
+    const int j = dof_joint[d];
+    if (j < 0) return Real(0);
+    return chain.impulses[3 * j] - chain.impulses[3 * j + 1] + chain.impulses[3 * j + 2];
+}
+
+// Mass-weighted motion of the chains under the impulses of their joints and on their links; each coordinate is summed
+// up by one lane.
+INLINE void push_chains(Chain& chain, const Lanes& lanes) {
+    const CollideRoom& room = chain.room.collide;
+    DIVIDED(lanes, d, DOFS) {
+        const int last = dof_depth[d] - 1;
+        Real sum = chain.active ? chain.inverse[d * DEPTH + last] * joint_impulse(chain, d) : Real(0);
+        if (chain.active) {
+            SOME for (int i = below_start[d]; i < below_start[d + 1]; i++) {
+                sum += chain.inverse[dof_below[i] * DEPTH + last] * joint_impulse(chain, dof_below[i]);
+            }
+        }
+        SOME for (int i = moved_start[d]; i < moved_start[d + 1]; i++) {
+            const int l = moved_link[i];
+            if (!chain.known[l]) continue;
+            const Column& column = room.columns[column_start[l] + last];
+            sum += dot(column.linear, room.pushes[l]) + dot(column.turning, room.moments[l]);
+        }
+        chain.moved[d] = sum;
+    }
+    lanes.sync();
+}
+#else
 // Makes the columns of a link that contact may move, where it is wanted, at the pose of the start of the step.
 INLINE void reveal(Environment& env, const Lanes& lanes, Motion* motions, int b, bool wanted) {
     int l = body_link(b);
@@ -445,56 +516,54 @@ INLINE void reveal(Environment& env, const Lanes& lanes, Motion* motions, int b,
     int depth = wanted ? link_depth[l] : 0;
     Vec origin = env.bodies[b].position;
     Column* columns = chain.columns + l * DEPTH;
-    ROOM(Column, single, DEPTH, chain.room);  // each coordinate alone
-    DIVIDED(lanes, i, depth) {
-        int d = link_above[l * DEPTH + i], from = dof_link[d], kind = link_kind[from];
-        Column& one = single[i];
-        one.turning = none();
-        if (kind == 1) {
-            int k = d - link_dof[from];
-            one.linear = k < 3 ? unit_vector(k) : cross(unit_vector(k - 3), origin - env.bodies[link_body[from]].position);
-            if (k >= 3) one.turning = unit_vector(k - 3);
-        } else if (kind == 2) {
-            one.turning = chain.axes[from];
-            one.linear = cross(one.turning, origin - env.bodies[link_body[from]].position);
-        } else {
-            one.linear = chain.axes[from];
-        }
-    }
-    lanes.sync();
-    DIVIDED(lanes, k, depth) {
+    Column single[DEPTH];  // each coordinate alone
+    for (int i = 0; i < depth; i++) single[i] = single_column(chain, env.bodies, link_above[l * DEPTH + i], origin);
+    for (int k = 0; k < depth; k++) {
         Column sum = {none(), none()};
-        INNER for (int i = k; i < depth; i++) {
+        for (int i = k; i < depth; i++) {
             Real part = chain.inverse[link_above[l * DEPTH + i] * DEPTH + k];
             sum.linear = sum.linear + part * single[i].linear;
             sum.turning = sum.turning + part * single[i].turning;
         }
         columns[k] = sum;
     }
-    if (wanted && lanes.writes()) {
+    if (wanted) {
         chain.known[l] = true;
         motions[b].depth = depth;
     }
-    lanes.sync();
 }
 
 // Adds an impulse and its moment about the link's origin to the mass-weighted motion of its chain.
-INLINE void push_link(Chain& chain, const Lanes& lanes, int l, Vec impulse, Vec moment) {
+INLINE void push_link(Chain& chain, int l, Vec impulse, Vec moment) {
     const Column* columns = chain.columns + l * DEPTH;
-    // the place of a coordinate is the same in all links: one lane does it for all of them
-    DIVIDED(lanes, k, link_depth[l]) {
+    for (int k = 0; k < link_depth[l]; k++) {
         chain.moved[link_above[l * DEPTH + k]] += dot(columns[k].linear, impulse) + dot(columns[k].turning, moment);
     }
 }
 
+// Mass-weighted motion of the chains under the impulses of their joints.
+INLINE void push_joints(Chain& chain) {
+    for (int d = 0; d < DOFS; d++) chain.moved[d] = Real(0);
+    if (!chain.active) return;  // all impulses are zero
+    for (int j = 0; j < JOINTS; j++) {
+        if (!chain.busy[j]) continue;
+        int d = joint_dof[j];
+        Real sum = chain.impulses[3 * j] - chain.impulses[3 * j + 1] + chain.impulses[3 * j + 2];
+        for (int k = 0; k < dof_depth[d]; k++) {
+            chain.moved[dof_above[d * DEPTH + k]] += sum * chain.inverse[d * DEPTH + k];
+        }
+    }
+}
+#endif
+
 // One pass over the limits and the dry friction of the joints, one after another in each branch.
-INLINE void sweep_joints(Chain& chain, const Lanes& lanes, Real h) {
+INLINE void sweep_joints(Chain& chain, const Lanes& lanes) {
     BRANCHES(lanes, j) {
-        if (!chain.acts[j]) continue;
+        if (!chain.busy[j]) continue;
         int d = joint_dof[j], depth = dof_depth[d];
         const Real* row = chain.inverse + d * DEPTH;
         Real speed = chain.speed[d], mobility = Real(0);
-        INNER for (int k = 0; k < depth; k++) {
+        EACH_ABOVE(k, depth) {
             speed += row[k] * chain.moved[dof_above[d * DEPTH + k]];
             mobility += row[k] * row[k];
         }
@@ -503,36 +572,25 @@ INLINE void sweep_joints(Chain& chain, const Lanes& lanes, Real h) {
         speed += (below - old[0]) * mobility;
         Real above = at_least(old[1] + mass * (chain.upper[j] + speed), Number(0));
         speed -= (above - old[1]) * mobility;
-        Real rubbed = old[2] - mass * speed, most = h * chain.servos[j].friction;
+        Real rubbed = old[2] - mass * speed, most = chain.most[j];
         if (plain(rubbed) > plain(most)) rubbed = most;
         if (plain(rubbed) < -plain(most)) rubbed = -most;
         Real change = (below - old[0]) - (above - old[1]) + (rubbed - old[2]);
         old[0] = below;
         old[1] = above;
         old[2] = rubbed;
-        INNER for (int k = 0; k < depth; k++) chain.moved[dof_above[d * DEPTH + k]] += change * row[k];
-    }
-}
-
-// Mass-weighted motion of the chains under the impulses of their joints.
-INLINE void push_joints(Chain& chain, const Lanes& lanes) {
-    DIVIDED(lanes, d, DOFS) chain.moved[d] = Real(0);
-    lanes.sync();
-    if (!chain.active) return;  // all impulses are zero
-    BRANCHES(lanes, j) {
-        if (!chain.acts[j]) continue;
-        int d = joint_dof[j];
-        Real sum = chain.impulses[3 * j] - chain.impulses[3 * j + 1] + chain.impulses[3 * j + 2];
-        INNER for (int k = 0; k < dof_depth[d]; k++) {
-            chain.moved[dof_above[d * DEPTH + k]] += sum * chain.inverse[d * DEPTH + k];
-        }
+        EACH_ABOVE(k, depth) chain.moved[dof_above[d * DEPTH + k]] += change * row[k];
     }
 }
 
 // Velocities that a link gains by the mass-weighted motion of its chain.
 INLINE void gain(const Chain& chain, int l, Vec& linear, Vec& angular) {
+#if SHARED
+    const Column* columns = chain.room.collide.columns + column_start[l];
+#else
     const Column* columns = chain.columns + l * DEPTH;
-    for (int k = 0; k < link_depth[l]; k++) {
+#endif
+    EACH_ABOVE(k, link_depth[l]) {
         Real moved = chain.moved[link_above[l * DEPTH + k]];
         linear = linear + moved * columns[k].linear;
         angular = angular + moved * columns[k].turning;
@@ -542,10 +600,10 @@ INLINE void gain(const Chain& chain, int l, Vec& linear, Vec& angular) {
 // Moves the links to where the roots and the joints put them, with their velocities.
 INLINE void spread(Environment& env, const Lanes& lanes) {
     Chain& chain = env.chain;
-    ROOM(Vec, positions, LINKS, chain.room.place);
-    ROOM(Vec, linear, LINKS, chain.room.place);
-    ROOM(Vec, angular, LINKS, chain.room.place);
-    ROOM(Quat, quats, LINKS, chain.room.place);
+    ROOM(Vec, positions, LINKS, chain.room.settle.place);
+    ROOM(Vec, linear, LINKS, chain.room.settle.place);
+    ROOM(Vec, angular, LINKS, chain.room.settle.place);
+    ROOM(Quat, quats, LINKS, chain.room.settle.place);
     ROOM(Vec, axes, LINKS, chain);
     DIVIDED(lanes, c, CHAINS) {
         int l = chain_root[c];
@@ -574,12 +632,11 @@ INLINE void spread(Environment& env, const Lanes& lanes) {
 INLINE void settle(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after) {
     Chain& chain = env.chain;
     Real h = env.laws[0].step_s, half_h = Number(0.5) * h;
-    ROOM(Real, first, DOFS, chain.room);
+    ROOM(Real, first, DOFS, chain.room.settle);
     DIVIDED(lanes, d, DOFS) {
-        first[d] = chain.speed[d];
-        INNER for (int k = 0; k < dof_depth[d]; k++) {
-            first[d] += chain.inverse[d * DEPTH + k] * chain.moved[dof_above[d * DEPTH + k]];
-        }
+        Real sum = chain.speed[d];
+        EACH_ABOVE(k, dof_depth[d]) sum += chain.inverse[d * DEPTH + k] * chain.moved[dof_above[d * DEPTH + k]];
+        first[d] = sum;
     }
     lanes.sync();
     DIVIDED(lanes, j, JOINTS) {

@@ -1,6 +1,6 @@
 // Moves a free body over one step, given velocity and angular momentum at its end: the position is advanced by the mean
 // velocity, the rotation by the angular velocity of the mean angular momentum at the midpoint.
-INLINE void advance(Body& body, const Constants& c, Vec omega_start, Vec velocity, Vec spin, Real h) {
+INLINE void advance(Body& body, const Weight& c, Vec omega_start, Vec velocity, Vec spin, Real h) {
     Real half_h = Number(0.5) * h;
     Quat half = normalized(multiply(body.quat, quat_exp(half_h * omega_start)));
     Vec mean = Real(Number(0.5)) * (body.spin + spin);
@@ -36,7 +36,7 @@ INLINE void stick(const Problem& problem, const Environment& env, const Lanes& l
     most = -lanes.least(-most);
     // the weights are normalised to that of the lowest sphere: the force does not depend on the number of spheres
     Real pull = -(env.laws[0].step_s * s.adhesion * most * reciprocal(at_least(sum, Number(1e-12))));
-    velocity.z += env.constants[b].inverse_mass * pull * sum;
+    velocity.z += weight(env, b).inverse_mass * pull * sum;
     spin.x += pull * arms.y;
     spin.y -= pull * arms.x;
 }
@@ -78,7 +78,7 @@ INLINE void apply(const Problem& problem, const Environment& env, const Lanes& l
     velocity = velocity + h * a;
     spin = spin - h * w.spin_damping * body.spin;
 #if TWISTED
-    spin = spin + h * (rotation * solved(env.constants[b].inverse_inertia, transposed(rotation, w.twist)));
+    spin = spin + h * (rotation * solved(weight(env, b).inverse_inertia, transposed(rotation, w.twist)));
 #endif
 #if SURFACE
     stick(problem, env, lanes, b, rotation, velocity, spin);
@@ -485,11 +485,13 @@ INLINE bool may_touch(const Environment& env, int p, const Mat* rotations, const
 
 // Makes the contact of slot `k` of a pair of bodies: 2 where it touches, 1 where it just opened, whose impulse of the
 // previous step acts until the first iteration, 0 for none.
-INLINE int make_contact(const Problem& problem, const Environment& env, const Own& own, int p, int k,
+INLINE int make_contact(const Problem& problem, const Environment& env, bool warm, Vec before, int p, int k,
                         const Mat* rotations, const Motion* motions, Number limit, Number near, const Parting& parting,
                         Contact& c, Real& weight) {
     int a = pair_a(p), b = pair_b(p), found = 2;
+#if !LINKS
     const Motion &ma = motions[a], &mb = motions[b];
+#endif
     Facing facing;
     if (!face(problem, env, p, k, rotations, limit, parting, facing)) return 0;
     c.normal = facing.normal;
@@ -497,12 +499,12 @@ INLINE int make_contact(const Problem& problem, const Environment& env, const Ow
     c.arm_b = facing.point - env.bodies[b].position;
     c.a = a;
     c.b = b;
-    c.slot = (contact_start(p) + k) / LANES;
+    c.slot = SLOT_OF(contact_start(p) + k);
     Real speed = dot(relative_velocity(c, motions), c.normal);
 #if LINKS
     Real inverse_mass = Real(0), mobility = Real(0);
-    add_mobility(ma, c.arm, c.normal, inverse_mass, mobility);
-    add_mobility(mb, c.arm_b, c.normal, inverse_mass, mobility);
+    add_mobility(response(RESPONSES(env, motions), a), c.arm, c.normal, inverse_mass, mobility);
+    add_mobility(response(RESPONSES(env, motions), b), c.arm_b, c.normal, inverse_mass, mobility);
 #else
     Vec turn_a = cross(c.arm, c.normal), turn_b = cross(c.arm_b, c.normal);
     Real inverse_mass = ma.inverse_mass + dot(turn_a, ma.inverse_inertia * turn_a) + mb.inverse_mass +
@@ -510,38 +512,36 @@ INLINE int make_contact(const Problem& problem, const Environment& env, const Ow
     Real mobility = mobility_trace(ma, c.arm) + mobility_trace(mb, c.arm_b);
 #endif
     if (!prepare(c, env.laws[pair_law(p)], facing.gap, speed, inverse_mass, mobility, weight)) {
-        if (!own.warm || !(plain(own.before[c.slot].x) > Number(0)) || !(facing.sharp_gap < near)) return 0;
+        if (!warm || !(plain(before.x) > Number(0)) || !(facing.sharp_gap < near)) return 0;
         c.target = Real(Number(-1e30));
         c.stop_n = c.stop_t = Real(1);
         found = 1;
     }
-    if (own.warm) {
-        Vec along = own.before[c.slot], one, two;
+    if (warm) {
+        Vec one, two;
         tangents(env, c.normal, one, two);
-        c.impulse = along.x * c.normal + along.y * one + along.z * two;
+        c.impulse = before.x * c.normal + before.y * one + before.z * two;
     }
     return found;
 }
 
 #if QUEUED
-// Slots of which a lane makes the contacts: from the front those against few spheres, from the back those against many,
-// so that all lanes come to these at the same time.
+// Slots of a lane that may have a contact: from the front those against few spheres, from the back those against many, so
+// that all lanes come to these at the same time.
 const int LONG = 16;
 struct Candidates {
     int slots[SLOTS], few, many;
     INLINE void add(int p, int k, bool longer) { slots[longer ? SLOTS - ++many : few++] = p << 16 | k; }
 };
 
-// Lists the slots of a pair of bodies that may meet, of which this lane makes the contacts later: those of all pairs
-// together, as each pair alone would leave most lanes idle.
-INLINE void queue_pair(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
-                       Motion* motions, Candidates& queue) {
+// Lists the slots of this lane of a pair of bodies that may meet. Contacts are made later: those of all pairs together, as
+// each pair alone would leave most lanes idle.
+INLINE void queue_pair(const Problem& problem, const Environment& env, const Own& own, int p, const Mat* rotations,
+                       Candidates& queue) {
     int a = pair_a(p), b = pair_b(p), start = contact_start(p);
-    const bool near = env.room.near[p];
-    reveal(env, own.lanes, motions, a, near);
-    reveal(env, own.lanes, motions, b, near);
-    if (!near) return;
-    const Number limit = env.room.limits[p];
+    const CollideRoom& room = env.chain.room.collide;
+    if (!room.near[p]) return;
+    const Number limit = room.limits[p];
     const int spheres_of_b = sphere_count(b);
     KEEP_LOOP
     for (int second = 0; second < 2; second++) {  // spheres of b, then those of a
@@ -556,6 +556,78 @@ INLINE void queue_pair(const Problem& problem, Environment& env, const Own& own,
             if (!beside(other, frame, sphere, limit)) queue.add(p, first - start + k, longer);
         }
     }
+}
+
+// Makes the contacts of one part of the slots that wait in all lanes, which the lanes share out evenly; `turn` is the
+// lane that gets the next one.
+INLINE void make_part(const Problem& problem, Environment& env, const Own& own, const Mat* rotations,
+                      const Motion* motions, const int* slots, int waiting, int& turn, Contact* list, Real* weights,
+                      int& count) {
+    CollideRoom& room = env.chain.room.collide;
+    int all;
+    const int first = own.lanes.before(waiting, all);
+    KEEP_LOOP
+    for (int from = 0; own.lanes.any(from < all); from += WAITING) {
+        KEEP_LOOP
+        for (int i = 0; i < waiting; i++) {
+            const int place = first + i - from;
+            if (place < 0 || place >= WAITING) continue;
+            const int slot = (contact_start(slots[i] >> 16) + (slots[i] & 0xffff)) / LANES;
+            room.queue.slots[place] = slots[i];
+            room.queue.before[place] = own.warm ? own.before[slot] : none();
+        }
+        own.lanes.sync();
+        const int end = all - from < WAITING ? all - from : WAITING;
+        KEEP_LOOP
+        for (int i = (own.lanes.lane - turn) & (LANES - 1); i < end; i += LANES) {
+            const int p = room.queue.slots[i] >> 16, k = room.queue.slots[i] & 0xffff;
+            const Vec before = room.queue.before[i];
+            Parting parting;
+            int found = make_contact(problem, env, plain(before.x) > Number(0), before, p, k, rotations, motions,
+                                     room.limits[p], room.nears[p], parting, list[count], weights[count]);
+            if (found == 2) room.touched[p] = true;
+            if (found > 0) count++;
+        }
+        if (end > 0) turn = (turn + end) & (LANES - 1);
+        own.lanes.sync();
+    }
+}
+
+// Gives each lane one of the contacts from `first` on, where there are not more than lanes, which takes one round in each
+// iteration.
+INLINE void spread_contacts(Environment& env, const Lanes& lanes, Contact* list, Real* weights, int first, int& count) {
+    int all;
+    const int offset = lanes.before(count - first, all);
+    const bool few = all <= LANES;
+    MoveRoom& room = env.chain.room.collide.moved;
+    for (int i = first; i < count && few; i++) {
+        room.contacts[offset + i - first] = list[i];
+        room.weights[offset + i - first] = weights[i];
+    }
+    lanes.sync();
+    if (few) {
+        count = first;
+        if (lanes.lane < all) {
+            list[count] = room.contacts[lanes.lane];
+            weights[count++] = room.weights[lanes.lane];
+        }
+    }
+    lanes.sync();
+}
+
+// Makes the contacts of all slots that wait, and distributes the effective mass among them.
+INLINE void make_queued(const Problem& problem, Environment& env, const Own& own, const Mat* rotations,
+                        const Motion* motions, const Candidates& queue, Contact* list, Real* weights, int& count) {
+    const int first = count;
+    int turn = 0;
+    KEEP_LOOP
+    for (int part = 0; part < 2; part++) {
+        const int* slots = queue.slots + (part ? SLOTS - queue.many : 0);
+        make_part(problem, env, own, rotations, motions, slots, part ? queue.many : queue.few, turn, list, weights, count);
+    }
+    if (!own.lanes.any(count > first)) return;
+    spread_contacts(env, own.lanes, list, weights, first, count);
+    share_out_pair(SHOWN_TO(own.lanes, env), list, weights, first, count, motions);
 }
 #else
 // Finds the contacts of two bodies and distributes the effective mass among them; returns how many touch.
@@ -581,7 +653,7 @@ __device__ int touch_pair(const Problem& problem, Environment& env, const Own& o
         for (int k = 0; k < 3; k++) env.parted[p][k] = parting.axis[k];
     }
 #endif
-#if LINKS
+#if LINKS && !SHARED
     reveal(env, own.lanes, motions, a, near);
     reveal(env, own.lanes, motions, b, near);
 #endif
@@ -593,8 +665,9 @@ __device__ int touch_pair(const Problem& problem, Environment& env, const Own& o
                 const Number* sphere = problem.geometry.value + env.geometry + 4LL * problem.spheres[start + k];
                 if (beside(second ? cb : ca, reach.frames[second], sphere, reach.limit)) continue;
             }
-            int found = make_contact(problem, env, own, p, k, rotations, motions, reach.limit, reach.near, parting,
-                                     list[count], weights[count]);
+            const Vec before = own.warm ? own.before[(start + k) / LANES] : none();
+            int found = make_contact(problem, env, own.warm, before, p, k, rotations, motions, reach.limit, reach.near,
+                                     parting, list[count], weights[count]);
             if (found == 2) touching++;
             if (found > 0) count++;
         }
@@ -605,6 +678,16 @@ __device__ int touch_pair(const Problem& problem, Environment& env, const Own& o
 #endif
 
 #if FIXED
+// Whether a body may touch a fixed surface in this step, in which none of its points moves farther than `margin`.
+INLINE bool near_surface(const Problem& problem, const Environment& env, const Fixed& fixed, int p, const Motion& m,
+                         Number& margin) {
+    const int a = pair_a(p);
+    Number h = plain(env.laws[0].step_s), reach = env.constants[a].reach;
+    margin = h * (size(m.velocity) + size(m.omega) * reach) + Number(1e-6);  // up to rounding
+    const Vec place = transposed(fixed.rotation, env.bodies[a].position - fixed.position);
+    return least_distance(problem, fixed, -2 - pair_b(p), place) - reach < margin;
+}
+
 // Finds the contacts of a body with a fixed surface and distributes the effective mass among them; returns how many
 // touch.
 __device__ int touch_surface(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
@@ -612,13 +695,10 @@ __device__ int touch_surface(const Problem& problem, Environment& env, const Own
     int a = pair_a(p), s = -2 - pair_b(p), first = count;
     const Motion& m = motions[a];
     Vec com = env.bodies[a].position;
-    Number h = plain(env.laws[0].step_s), reach = env.constants[a].reach;
-    // no point of the body moves further in this step, up to rounding
-    Number margin = h * (size(m.velocity) + size(m.omega) * reach) + Number(1e-6);
+    Number margin;
     Fixed fixed = fixed_surface(problem, env, s);
-    const Vec place = transposed(fixed.rotation, com - fixed.position);
-    const bool near = least_distance(problem, fixed, s, place) - reach < margin;
-#if LINKS
+    const bool near = near_surface(problem, env, fixed, p, m, margin);
+#if LINKS && !SHARED
     reveal(env, own.lanes, motions, a, near);
 #endif
     if (near) {
@@ -638,11 +718,11 @@ __device__ int touch_surface(const Problem& problem, Environment& env, const Own
             c.arm_b = none();
             c.a = a;
             c.b = -2;
-            c.slot = (start + k) / LANES;
+            c.slot = SLOT_OF(start + k);
             Real speed = dot(m.velocity + cross(m.omega, c.arm), c.normal);
 #if LINKS
             Real inverse_mass = Real(0), mobility = Real(0);
-            add_mobility(m, c.arm, c.normal, inverse_mass, mobility);
+            add_mobility(response(RESPONSES(env, motions), a), c.arm, c.normal, inverse_mass, mobility);
 #else
             Vec turn = cross(c.arm, c.normal);
             Real inverse_mass = m.inverse_mass + dot(turn, m.inverse_inertia * turn);
@@ -650,7 +730,7 @@ __device__ int touch_surface(const Problem& problem, Environment& env, const Own
 #endif
             if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weight)) continue;
             if (own.warm) {
-                Vec along = own.before[c.slot], one, two;
+                Vec along = own.before[(start + k) / LANES], one, two;
                 tangents(env, c.normal, one, two);
                 c.impulse = along.x * c.normal + along.y * one + along.z * two;
             }
@@ -667,7 +747,9 @@ __device__ int touch_surface(const Problem& problem, Environment& env, const Own
 __device__ int touch_plane_link(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
                                 Motion* motions, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), first = count, start = contact_start(p);
+#if !SHARED
     reveal(env, own.lanes, motions, a, true);
+#endif
     Vec up = vec(Real(0), Real(0), Real(1));
     EACH_OWNED(own.lanes, start, contact_count(p), k) {
         long long row = env.geometry + 4LL * problem.spheres[start + k];
@@ -677,12 +759,12 @@ __device__ int touch_plane_link(const Problem& problem, Environment& env, const 
         c.arm_b = none();
         c.a = a;
         c.b = -1;
-        c.slot = (start + k) / LANES;
+        c.slot = SLOT_OF(start + k);
         Real gap = env.bodies[a].position.z - env.ground + c.arm.z, inverse_mass = Real(0), mobility = Real(0);
         Real speed = relative_velocity(c, motions).z;
-        add_mobility(motions[a], c.arm, up, inverse_mass, mobility);
+        add_mobility(response(RESPONSES(env, motions), a), c.arm, up, inverse_mass, mobility);
         if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weights[count])) continue;
-        c.impulse = own.before[c.slot];
+        c.impulse = own.before[(start + k) / LANES];
         count++;
     }
     if (own.lanes.any(count > first)) share_out_pair(SHOWN_TO(own.lanes, env), list, weights, first, count, motions);
@@ -703,7 +785,7 @@ INLINE void split(Contact* list, int count, const int* groups) {
 }
 #endif
 
-#if PAIRED
+#if PAIRED && !LINKS
 struct Load {  // what the contacts of a pair do to their bodies: change of a's velocity and, with the sign of a, of b's
     Vec linear_a, linear_b, turn_a, turn_b;
 };
@@ -752,32 +834,34 @@ INLINE void aim_under_load(const Law& law, Contact* list, int first, int end, co
 #endif
 
 #if SHARED
-// Lists the bodies that contacts may move: links that are known, then the free bodies.
+// Lists the bodies that contacts may move: links that are known, then the free bodies, which come after all links.
 INLINE void list_reached(Environment& env, const Lanes& lanes) {
-    Chain& chain = env.chain;
+    CollideRoom& room = env.chain.room.collide;
     if (lanes.writes()) {
         int count = 0;
-        KEEP_LOOP
+        EACH_SHOWN
         for (int l = 0; l < LINKS; l++) {
-            if (chain.known[l]) chain.reached[count++] = link_body[l];
+            if (env.chain.known[l]) room.reached[count++] = l;
         }
-        chain.reached_links = count;
-        KEEP_LOOP
+        EACH_SHOWN
         for (int b = 0; b < BODIES; b++) {
-            if (is_free(b)) chain.reached[count++] = b;
+            if (is_free(b)) room.reached[count++] = LINKS + FREE(b);
         }
-        chain.reached_count = count;
+        room.reached_count = count;
     }
     lanes.sync();
 }
+
+// The body of a place in the list of those that contacts may move.
+INLINE int body_at(int place) { return place < LINKS ? link_body[place] : free_body(place - LINKS); }
 
 // Changes the impulses of the contacts by one iteration where it is asked for, and sums up what they do to each body that
 // they may move. In each round every lane shows one contact; each of these bodies is summed up by one lane.
 INLINE void sweep_contacts(Environment& env, const Lanes& lanes, Contact* list, int count, const Motion* motions,
                            bool changes) {
-    Chain& chain = env.chain;
-    ContactRoom& room = chain.room.free.contacts;
-    DIVIDED(lanes, r, chain.reached_count) chain.pushes[r] = chain.moments[r] = none();
+    CollideRoom& all = env.chain.room.collide;
+    ContactRoom& room = all.contacts;
+    DIVIDED(lanes, r, all.reached_count) all.pushes[all.reached[r]] = all.moments[all.reached[r]] = none();
     KEEP_LOOP
     for (int i = 0; lanes.any(i < count); i++) {
         room.bodies[lanes.lane] = -1;
@@ -790,9 +874,9 @@ INLINE void sweep_contacts(Environment& env, const Lanes& lanes, Contact* list, 
             room.bodies[lanes.lane] = bodies_of(c);
         }
         lanes.sync();
-        DIVIDED(lanes, r, chain.reached_count) {
-            const int body = chain.reached[r];
-            Vec push = chain.pushes[r], moment = chain.moments[r];
+        DIVIDED(lanes, r, all.reached_count) {
+            const int place = all.reached[r], body = body_at(place);
+            Vec push = all.pushes[place], moment = all.moments[place];
             EACH_SHOWN
             for (int shown = 0; shown < LANES; shown++) {
                 const int bodies = room.bodies[shown];
@@ -804,8 +888,8 @@ INLINE void sweep_contacts(Environment& env, const Lanes& lanes, Contact* list, 
                     moment = moment - room.third[shown];
                 }
             }
-            chain.pushes[r] = push;
-            chain.moments[r] = moment;
+            all.pushes[place] = push;
+            all.moments[place] = moment;
         }
         lanes.sync();
     }
@@ -815,28 +899,22 @@ INLINE void sweep_contacts(Environment& env, const Lanes& lanes, Contact* list, 
 // iteration the moments are added to the angular momenta.
 INLINE void move_bodies(Environment& env, const Lanes& lanes, Motion* motions, Vec* spins, bool joints, bool last) {
     Chain& chain = env.chain;
-    push_joints(chain, lanes);
+    const CollideRoom& room = chain.room.collide;
+    push_chains(chain, lanes);
+    if (joints && chain.active) sweep_joints(chain, lanes);
     lanes.sync();
-    KEEP_LOOP
-    for (int r = 0; r < chain.reached_links; r++) {
-        push_link(chain, lanes, body_link(chain.reached[r]), chain.pushes[r], chain.moments[r]);
-    }
-    lanes.sync();
-    if (joints && chain.active) sweep_joints(chain, lanes, env.laws[0].step_s);
-    lanes.sync();
-    DIVIDED(lanes, r, chain.reached_count) {
-        const int b = chain.reached[r];
-        Motion& m = motions[b];
-        Vec velocity = chain.room.free.free_velocities[b], omega = chain.room.free.free_omegas[b];
-        if (r < chain.reached_links) {
-            gain(chain, body_link(b), velocity, omega);
+    DIVIDED(lanes, r, room.reached_count) {
+        const int place = room.reached[r];
+        Velocities m = room.free[place];
+        if (place < LINKS) {
+            gain(chain, place, m.velocity, m.omega);
         } else {
-            velocity = velocity + m.inverse_mass * chain.pushes[r];
-            omega = omega + m.inverse_inertia * chain.moments[r];
-            if (last) spins[FREE(b)] = spins[FREE(b)] + chain.moments[r];
+            const int f = place - LINKS;
+            m.velocity = m.velocity + chain.free_masses[f] * room.pushes[place];
+            m.omega = m.omega + chain.free_inertias[f] * room.moments[place];
+            if (last) spins[f] = spins[f] + room.moments[place];
         }
-        m.velocity = velocity;
-        m.omega = omega;
+        motions[body_at(place)] = m;
     }
     lanes.sync();
 }
@@ -854,6 +932,61 @@ INLINE void forget(Own& own) {
 #endif
     own.warm = false;
 }
+
+#if QUEUED
+// As `keep`, and notes the impulses of labels: the lane that made a contact shows it to that of its slot.
+INLINE void keep_shown(Environment& env, Own& own, const Contact* list, int count, int sweeps) {
+    ContactRoom& room = env.chain.room.collide.contacts;
+    forget(own);
+    int kept = 0;
+    KEEP_LOOP
+    for (int i = 0; own.lanes.any(i < count); i++) {
+        const int lane = own.lanes.lane;
+        room.bodies[lane] = -1;
+        if (i < count) {
+            const Contact& c = list[i];
+            room.first[lane] = c.impulse;
+            room.second[lane] = c.normal;
+            room.bodies[lane] = c.slot << 1 | (c.b == -1);
+#if RECORD
+            room.third[lane] = env.bodies[c.a].position + c.arm;
+            room.weight[lane] = c.gap;
+#if LAWS > 1
+            room.friction[lane] = c.friction;
+#endif
+#endif
+        }
+        own.lanes.sync();
+        KEEP_LOOP
+        for (int shown = 0; shown < LANES; shown++) {
+            const int contact = room.bodies[shown] >> 1, slot = contact / LANES;
+            if (contact < 0 || owner(contact) != lane) continue;
+            const Vec impulse = room.first[shown], normal = room.second[shown];
+            Vec one, two;
+            tangents(env, normal, one, two);
+            Vec along = vec(dot(impulse, normal), dot(impulse, one), dot(impulse, two));
+            if (sweeps > 1) {  // a single iteration starts at zero
+                own.before[slot] = room.bodies[shown] & 1 ? impulse : along;
+                own.kept[kept++] = slot;
+            }
+#if RECORD
+            Contact c;
+            c.impulse = impulse;
+            c.normal = normal;
+            c.arm = room.third[shown];
+            c.gap = room.weight[shown];
+#if LAWS > 1
+            c.friction = room.friction[shown];
+#endif
+            note(own.tallies[slot], c, env.laws[0], none());
+#endif
+        }
+        own.lanes.sync();
+    }
+    own.kept_count = kept;
+    own.warm = kept > 0;
+}
+#endif
 
 // Stores the impulses of a step as the start of the next one's iterations; a single iteration starts at zero.
 INLINE void keep(const Environment& env, Own& own, const Contact* list, int count, int sweeps) {
@@ -882,7 +1015,7 @@ INLINE void keep(const Environment& env, Own& own, const Contact* list, int coun
 #if PATCHES
 // Distributes the effective mass among the contacts of a patch in proportion to their areas: `_share_by_area` of
 // impulse_solver.
-INLINE void share_by_area(const Lanes& lanes, const Moments& moments, const Motion& motion, Contact* list,
+INLINE void share_by_area(const Lanes& lanes, const Moments& moments, const Moving& motion, Contact* list,
                           const Real* weights, int first, int count) {
     Real spread = Real(0), mobility = Real(0);
     EACH_CONTACT(list, first, count) {
@@ -898,7 +1031,7 @@ INLINE void share_by_area(const Lanes& lanes, const Moments& moments, const Moti
 // Finds the contacts of a body with the ground. They are appended to the list (LISTED), or each is stored in its own
 // slot.
 INLINE void touch_plane(const Problem& problem, const Environment& env, const Own& own, int p, const Mat& rotation,
-                        const Motion& motion, Contact* list, Real* weights, int& count) {
+                        const Moving& motion, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), first = count;
     Moments moments = {Real(0), Real(0), Real(0), Real(0), Real(0), Real(0)};
     Real height = env.bodies[a].position.z - env.ground;
@@ -952,7 +1085,7 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, const Ow
             list[i].b = -1;
 #endif
 #if LISTED
-            list[i].slot = contact / LANES;
+            list[i].slot = SLOT_OF(contact);
             list[i].impulse = own.before[contact / LANES];
 #endif
         }
@@ -977,32 +1110,57 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, const Ow
 #endif
 }
 
+#if SHARED
+// Finds the pairs that may touch in this step, and marks the links that belong to them.
+INLINE void find_near_pairs(const Problem& problem, Environment& env, const Lanes& lanes, const Mat* rotations,
+                            const Motion* motions) {
+    CollideRoom& room = env.chain.room.collide;
+    DIVIDED(lanes, p, PAIRS) {
+        const int a = pair_a(p), b = pair_b(p);
+        bool near = false;
+        if (b >= 0) {
+            Reach reach;
+            near = may_touch(env, p, rotations, motions, reach);
+            room.limits[p] = reach.limit;
+            room.nears[p] = reach.near;
+        } else if (b == -1) {
+            near = near_ground(env, a, motions[a]);
+        } else {
+#if FIXED
+            Number margin;
+            near = near_surface(problem, env, fixed_surface(problem, env, -2 - b), p, motions[a], margin);
+#endif
+        }
+        room.near[p] = near;
+        room.touched[p] = false;
+        if (near && body_link(a) >= 0) env.chain.known[body_link(a)] = true;
+        if (near && b >= 0 && body_link(b) >= 0) env.chain.known[body_link(b)] = true;
+    }
+    lanes.sync();
+}
+#endif
+
 // Finds the contacts of a step and their impulses, and adds these to the bodies' velocities and angular momenta.
 INLINE void collide(const Problem& problem, Environment& env, Own& own, const Mat* rotations, Motion* motions,
                     Vec* velocities, Vec* spins) {
 #if HOST && LANES == 1 && SLOTS > 2048
-    static thread_local Contact list[SLOTS];  // too large for a stack
-    static thread_local Real weights[SLOTS];
+    static thread_local Contact list[LIST_ROOM];  // too large for a stack
+    static thread_local Real weights[LIST_ROOM];
 #else
-    Contact list[SLOTS];
-    Real weights[SLOTS];
+    Contact list[LIST_ROOM];
+    Real weights[LIST_ROOM];
 #endif
     int count = 0;
 #if PAIRED
-    ROOM(int, groups, BODIES, env.room);
+    ROOM(int, groups, BODIES, env.chain.room.collide);
     DIVIDED(own.lanes, b, BODIES) groups[b] = 0;
 #if !LINKS
     int ends[PAIR_ROOM], loaded = 0;
 #endif
 #if SHARED
-    DIVIDED(own.lanes, p, PAIRS) {
-        Reach reach;
-        env.room.near[p] = pair_b(p) >= 0 && may_touch(env, p, rotations, motions, reach);
-        env.room.limits[p] = reach.limit;
-        env.room.nears[p] = reach.near;
-        env.room.touched[p] = false;
-    }
-    own.lanes.sync();
+    find_near_pairs(problem, env, own.lanes, rotations, motions);
+    reveal_links(env.chain, own.lanes, env.bodies);
+    CollideRoom& room = env.chain.room.collide;
 #endif
 #if QUEUED
     Candidates queue;
@@ -1013,10 +1171,10 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
         int a = pair_a(p), b = pair_b(p), touching = 0;
         if (b >= 0) {
 #if SHARED
-            if (!own.lanes.any(env.room.near[p])) continue;
+            if (!own.lanes.any(room.near[p])) continue;
 #endif
 #if QUEUED
-            queue_pair(problem, env, own, p, rotations, motions, queue);
+            queue_pair(problem, env, own, p, rotations, queue);
 #else
             touching = touch_pair(problem, env, own, p, rotations, motions, list, weights, count);
 #endif
@@ -1032,12 +1190,13 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
 #endif
             {
             touching = -count;
-            touch_plane(problem, env, own, p, rotations[a], motions[a], list, weights, count);
+            const Moving& all = moving(RESPONSES(env, motions), motions, a);
+            touch_plane(problem, env, own, p, rotations[a], all, list, weights, count);
             touching += count;
             }
         }
 #if SHARED
-        if (touching > 0) env.room.touched[p] = true;
+        if (touching > 0) room.touched[p] = true;
 #else
         if (own.lanes.any(touching > 0) && own.lanes.sum(Number(touching)) > Number(0)) {
             groups[group_of(a)]++;
@@ -1052,30 +1211,14 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
 #endif
     }
 #if QUEUED
-    const int before_queue = count;
-    KEEP_LOOP
-    for (int part = 0; part < 2; part++) {
-        KEEP_LOOP
-        for (int i = part ? SLOTS - queue.many : 0; i < (part ? SLOTS : queue.few); i++) {
-            int p = queue.slots[i] >> 16, k = queue.slots[i] & 0xffff;
-            Parting parting;
-            int found = make_contact(problem, env, own, p, k, rotations, motions, env.room.limits[p],
-                                     env.room.nears[p], parting, list[count], weights[count]);
-            if (found == 2) env.room.touched[p] = true;
-            if (found > 0) count++;
-        }
-        own.lanes.sync();
-    }
-    if (own.lanes.any(count > before_queue)) {
-        share_out_pair(SHOWN_TO(own.lanes, env), list, weights, before_queue, count, motions);
-    }
+    make_queued(problem, env, own, rotations, motions, queue, list, weights, count);
 #endif
 #if SHARED
     own.lanes.sync();
-    for (int p = 0; p < PAIRS && own.lanes.writes(); p++) {
-        if (!env.room.touched[p]) continue;
-        groups[group_of(pair_a(p))]++;
-        if (pair_b(p) >= 0 && group_of(pair_b(p)) >= 0) groups[group_of(pair_b(p))]++;
+    DIVIDED(own.lanes, p, PAIRS) {
+        if (!room.touched[p]) continue;
+        Lanes::count_up(groups[group_of(pair_a(p))]);
+        if (pair_b(p) >= 0 && group_of(pair_b(p)) >= 0) Lanes::count_up(groups[group_of(pair_b(p))]);
     }
     own.lanes.sync();
 #endif
@@ -1104,15 +1247,13 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
     }
 #endif
 #if !SHARED
-    Vec linear[BODIES], angular[BODIES];
-#endif
-    ROOM(Vec, free_velocities, BODIES, env.chain.room.free);
-    ROOM(Vec, free_omegas, BODIES, env.chain.room.free);
+    Vec linear[BODIES], angular[BODIES], free_velocities[BODIES], free_omegas[BODIES];
     EACH_BODY
-    DIVIDED(own.lanes, b, BODIES) {
+    for (int b = 0; b < BODIES; b++) {
         free_velocities[b] = motions[b].velocity;
         free_omegas[b] = motions[b].omega;
     }
+#endif
 #if SURFACE
     Real touching = Real(own.lanes.sum(Number(count)));
     const Sym& J = motions[0].inverse_inertia;
@@ -1128,6 +1269,8 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
     if (own.lanes.any(env.chain.active)) sweep = -1;
 #if SHARED
     list_reached(env, own.lanes);
+    DIVIDED(own.lanes, r, room.reached_count) room.free[room.reached[r]] = motions[body_at(room.reached[r])];
+    own.lanes.sync();
 #else
     // links that are touched, and the bodies that are no links or such ones
     int reached[LINKS], reached_count = 0, touched[BODIES], touched_count = 0;
@@ -1191,12 +1334,12 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
         }
 #endif
 #if LINKS
-        push_joints(env.chain, own.lanes);
+        push_joints(env.chain);
         for (int i = 0; i < reached_count; i++) {
             int l = reached[i], b = link_body[l];
-            push_link(env.chain, own.lanes, l, linear[b], angular[b]);
+            push_link(env.chain, l, linear[b], angular[b]);
         }
-        if (sweep >= 0 && env.chain.active) sweep_joints(env.chain, own.lanes, env.laws[0].step_s);
+        if (sweep >= 0 && env.chain.active) sweep_joints(env.chain, own.lanes);
         for (int i = 0; i < reached_count; i++) {
             int l = reached[i], b = link_body[l];
             motions[b].velocity = free_velocities[b];
@@ -1233,7 +1376,11 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
         }
 #endif
     } while (++sweep < problem.sweeps);
+#if QUEUED
+    keep_shown(env, own, list, count, problem.sweeps);
+#else
     keep(env, own, list, count, problem.sweeps);
+#endif
     EACH_BODY
     for (int b = 0; b < BODIES; b++) {
         if (!is_free(b) || !own.lanes.writes()) continue;
@@ -1243,7 +1390,7 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
 #endif
     }
     own.lanes.sync();
-#if RECORD
+#if RECORD && !QUEUED
 #if PAIRED
     for (int i = 0; i < count; i++) note(own.tallies[list[i].slot], list[i], env.laws[0], env.bodies[list[i].a].position);
 #elif LISTED

@@ -5,8 +5,7 @@ struct Law {  // of a pair of materials, in a step
 #endif
 };
 
-struct Motion {  // velocities of a body without contact, and inverse mass and inertia; 0 if it is not free
-    Vec velocity, omega;
+struct Response {  // of a body to impulses: inverse mass and inertia, 0 if it is not free
     Real inverse_mass;
     Sym inverse_inertia;  // world axes
 #if LINKS
@@ -15,30 +14,39 @@ struct Motion {  // velocities of a body without contact, and inverse mass and i
 #endif
 };
 
-struct Contact {  // world frame, impulse on body a
-    Vec arm, impulse;
-    Real target, stop_n, stop_t;
-#if LAWS > 1
-    Real friction;
-#endif
-#if SURFACE
-    Real friction, steady_x, steady_y;  // steady: fixed impulses (viscosity)
-    Vec turning;                        // angular impulse of rolling and torsional friction
-#if ELLIPTIC
-    Ellipse ellipse;  // replaces the friction coefficient
-#endif
-#endif
-#if PAIRED
-    Vec normal, arm_b;
-    Real gap;
-    int a, b;  // b: -1 for the ground, -2 for a fixed surface
-#endif
-#if LISTED
-    int slot;
+struct Moving : Velocities, Response {};
+
+// What is kept of each body in a step. Where lanes share one copy of it, responses are made when they are needed: those
+// of most bodies are not, as they are links that nothing touches.
+#if SHARED
+typedef Velocities Motion;
+typedef const Chain& Responses;
+#define RESPONSES(env, motions) (env).chain
+INLINE Response response(const Chain& chain, int b) {
+    const int l = body_link(b);
+    Response r = {Real(0), no_inertia(), 0, 0};
+    if (is_free(b)) {
+        r.inverse_mass = chain.free_masses[FREE(b)];
+        r.inverse_inertia = chain.free_inertias[FREE(b)];
+    } else if (l >= 0 && chain.known[l]) {
+        r.columns = chain.room.collide.columns + column_start[l];
+        r.depth = link_depth[l];
+    }
+    return r;
+}
+INLINE Moving moving(const Chain& chain, const Motion* motions, int b) {
+    Moving all;
+    static_cast<Velocities&>(all) = motions[b];
+    static_cast<Response&>(all) = response(chain, b);
+    return all;
+}
 #else
-    bool on;
+typedef Moving Motion;
+typedef const Motion* Responses;
+#define RESPONSES(env, motions) motions
+INLINE const Moving& response(const Motion* motions, int b) { return motions[b]; }
+INLINE const Moving& moving(const Motion* motions, const Motion*, int b) { return motions[b]; }
 #endif
-};
 
 INLINE Real friction_of(const Law& law, const Contact& c) {
 #if SURFACE || LAWS > 1
@@ -48,17 +56,17 @@ INLINE Real friction_of(const Law& law, const Contact& c) {
 #endif
 }
 
-INLINE Real mobility_trace(const Motion& m, Vec arm) {
+INLINE Real mobility_trace(const Response& m, Vec arm) {
     return Number(3) * m.inverse_mass + trace(m.inverse_inertia) * dot(arm, arm) - dot(arm, m.inverse_inertia * arm);
 }
 
 #if LINKS
 // Adds what a body's point moves along a direction by an impulse along it, and the sum of that over three directions.
-INLINE void add_mobility(const Motion& m, Vec arm, Vec normal, Real& inverse_mass, Real& trace_of) {
+INLINE void add_mobility(const Response& m, Vec arm, Vec normal, Real& inverse_mass, Real& trace_of) {
     Vec turn = cross(arm, normal);
     inverse_mass += m.inverse_mass + dot(turn, m.inverse_inertia * turn);
     trace_of += mobility_trace(m, arm);
-    INNER for (int k = 0; k < m.depth; k++) {
+    EACH_ABOVE(k, m.depth) {
         Vec moved = m.columns[k].linear + cross(m.columns[k].turning, arm);
         inverse_mass += square(dot(normal, moved));
         trace_of += dot(moved, moved);
@@ -66,10 +74,10 @@ INLINE void add_mobility(const Motion& m, Vec arm, Vec normal, Real& inverse_mas
 }
 
 // Velocity and angular velocity of a body by an impulse along a direction, with its moment.
-INLINE void response_of(const Motion& m, Vec normal, Vec turn, Vec& linear, Vec& angular) {
+INLINE void response_of(const Response& m, Vec normal, Vec turn, Vec& linear, Vec& angular) {
     linear = m.inverse_mass * normal;
     angular = m.inverse_inertia * turn;
-    INNER for (int k = 0; k < m.depth; k++) {
+    EACH_ABOVE(k, m.depth) {
         Real along = dot(m.columns[k].linear, normal) + dot(m.columns[k].turning, turn);
         linear = linear + along * m.columns[k].linear;
         angular = angular + along * m.columns[k].turning;
@@ -182,7 +190,7 @@ INLINE Moments sum_rows(const Lanes& lanes, const Moments& m) {
     Moments s = {lanes.sum(m.w), lanes.sum(m.x), lanes.sum(m.y), lanes.sum(m.xx), lanes.sum(m.xy), lanes.sum(m.yy)};
     return s;
 }
-INLINE Real crowd(const Moments& m, const Motion& a, const Contact& c) {
+INLINE Real crowd(const Moments& m, const Moving& a, const Contact& c) {
     const Sym& J = a.inverse_inertia;
     Real x = c.arm.y, y = -c.arm.x;
     Real w = a.inverse_mass, u = J.xx * x + J.xy * y, v = J.xy * x + J.yy * y;
@@ -191,7 +199,7 @@ INLINE Real crowd(const Moments& m, const Motion& a, const Contact& c) {
 }
 
 // Prepares a contact with the ground, whose normal is z; `arm` is the lever arm of the sphere's centre.
-INLINE bool touch_ground(Contact& c, const Law& law, const Motion& a, Vec arm, Real height, Real radius,
+INLINE bool touch_ground(Contact& c, const Law& law, const Moving& a, Vec arm, Real height, Real radius,
                          Real& weight) {
     const Sym& J = a.inverse_inertia;
     c.arm = vec(arm.x, arm.y, arm.z - radius);
@@ -204,7 +212,7 @@ INLINE bool touch_ground(Contact& c, const Law& law, const Motion& a, Vec arm, R
 #if SURFACE
 // Sets the effects of the surface on a ground contact: local friction, and viscous drag, which is distributed among all
 // contacts by weight; `total` is the sum of their weights.
-INLINE void surface(Contact& c, const Law& law, const Motion& a, Vec com, Real weight, Real total) {
+INLINE void surface(Contact& c, const Law& law, const Moving& a, Vec com, Real weight, Real total) {
     const Surface& s = law.surface;
     Real u = a.velocity.x + a.omega.y * c.arm.z - a.omega.z * c.arm.y;
     Real v = a.velocity.y + a.omega.z * c.arm.x - a.omega.x * c.arm.z;
@@ -221,7 +229,7 @@ INLINE void surface(Contact& c, const Law& law, const Motion& a, Vec com, Real w
 
 // Angular impulse of rolling and torsional friction after one iteration. `across` and `about` are the reciprocals of
 // the mobility about horizontal axes and about the normal, times the number of contacts that act on the same spin.
-INLINE Vec turned_by(const Contact& c, const Law& law, const Motion& a, Real across, Real about) {
+INLINE Vec turned_by(const Contact& c, const Law& law, const Moving& a, Real across, Real about) {
     Real x = c.turning.x - across * a.omega.x, y = c.turning.y - across * a.omega.y;
     Real z = c.turning.z - about * a.omega.z;
     Real roll = shortened(x * x + y * y, law.surface.rolling * c.impulse.z);
@@ -277,6 +285,9 @@ INLINE void squares_to(const Union& spheres, int first, const Number* point, Num
     }
 }
 
+// The first members of a union that take part, which a GPU keeps in registers.
+const int HELD_MEMBERS = SHARED && !HOST ? 4 : 0;
+
 // Returns whether the union is nearer than `limit`; then also its smooth distance, that of the nearest sphere, and the
 // outward normal. Where that is undefined, between opposite spheres, it is `up`. All in the frame of the union.
 __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec up, Real& distance, Number& nearest,
@@ -300,8 +311,13 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     if (nearest - width > limit) return false;
     // only spheres within the width of the nearest one take part: they are found once
     const int most = 64;
-    int members[most], found = 0;
-    Number gaps[most];
+    int members[most], found = 0, kept[HELD_MEMBERS + 1];
+    Number gaps[most], held[HELD_MEMBERS + 1];
+    SPREAD
+    for (int q = 0; q < HELD_MEMBERS; q++) {
+        kept[q] = 0;
+        held[q] = Number(1e30);
+    }
     for (int first = 0; first < spheres.count; first += AT_ONCE) {
         squares_to(spheres, first, point, squares, radii);
         SPREAD
@@ -311,7 +327,12 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
             if (!below(squares[k], radius, nearest + width)) continue;
             Number gap = root(squares[k]) - radius - nearest;
             if (!(gap < width)) continue;
-            if (found < most) {
+            SPREAD
+            for (int q = 0; q < HELD_MEMBERS; q++) {
+                kept[q] = found == q ? first + k : kept[q];
+                held[q] = found == q ? gap : held[q];
+            }
+            if (found >= HELD_MEMBERS && found < most) {
                 members[found] = first + k;
                 gaps[found] = gap;
             }
@@ -319,7 +340,20 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
         }
     }
     bool few = found <= most;
-#define EACH_MEMBER for (int m = 0; m < (few ? found : spheres.count); m++)
+    const int listed = few ? HELD_MEMBERS : 0;
+    if (!few) {
+        SPREAD
+        for (int q = 0; q < HELD_MEMBERS; q++) held[q] = Number(1e30);
+    }
+    Vec aways[HELD_MEMBERS + 1];
+    Real lengths[HELD_MEMBERS + 1], radii_held[HELD_MEMBERS + 1];
+    SPREAD
+    for (int q = 0; q < HELD_MEMBERS; q++) {
+        aways[q] = at - spheres.center(kept[q]);
+        radii_held[q] = spheres.radius(kept[q]);
+        lengths[q] = root(dot(aways[q], aways[q]));
+    }
+#define EACH_MEMBER for (int m = listed; m < (few ? found : spheres.count); m++)
 #define MEMBER                                                                                     \
     int i = few ? members[m] : m;                                                                  \
     Number gap = few ? gaps[m] : root(square_to(spheres, i, point)) - plain_radius(spheres, i) - nearest;
@@ -327,6 +361,12 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     Number t = width;
     for (int round = 0; round < 40; round++) {
         Number squares = Number(0), sum = Number(0);
+        SPREAD
+        for (int q = 0; q < HELD_MEMBERS; q++) {
+            Number below = greater(t - held[q], Number(0));
+            squares += below * below;
+            sum += below;
+        }
         EACH_MEMBER {
             MEMBER
             Number below = t - gap;
@@ -342,6 +382,14 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     // once the set of active spheres is known: the closed form and its derivative
     Real first = Real(0), second = Real(0);
     Number count = Number(0);
+    SPREAD
+    for (int q = 0; q < HELD_MEMBERS; q++) {
+        if (!(held[q] < t)) continue;
+        Real x = lengths[q] - radii_held[q] - Real(nearest);
+        first += x;
+        second += x * x;
+        count += Number(1);
+    }
     EACH_MEMBER {
         MEMBER
         if (!(gap < t)) continue;
@@ -355,6 +403,14 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
     Real solved = reciprocal(Real(count)) * (first + root(inside));
     Real cubes = Real(0);
     Vec gradient = none();
+    SPREAD
+    for (int q = 0; q < HELD_MEMBERS; q++) {
+        if (!(held[q] < t)) continue;
+        Real a = Number(1 / SMOOTHING_M) * (solved - (lengths[q] - radii_held[q] - Real(nearest)));
+        a = at_least(a, Number(0));
+        cubes += a * a * a;
+        gradient = gradient + a * a * reciprocal(at_least(lengths[q], Number(1e-12))) * aways[q];
+    }
     EACH_MEMBER {
         MEMBER
         if (!(gap < t)) continue;
@@ -554,11 +610,11 @@ INLINE int bodies_of(const Contact& c) { return c.a << 16 | (c.b & 0xffff); }
 #endif
 
 // What a contact with a unit impulse along its normal does to both bodies: velocity of a relative to b, and rotations.
-INLINE void unit_response(const Contact& c, const Motion* bodies, Vec& normal, Vec& turn_a, Vec& turn_b) {
+INLINE void unit_response(const Contact& c, Responses bodies, Vec& normal, Vec& turn_a, Vec& turn_b) {
 #if LINKS
     Vec other = none();
-    response_of(bodies[c.a], c.normal, cross(c.arm, c.normal), normal, turn_a);
-    if (c.b >= 0) response_of(bodies[c.b], c.normal, cross(c.arm_b, c.normal), other, turn_b);
+    response_of(response(bodies, c.a), c.normal, cross(c.arm, c.normal), normal, turn_a);
+    if (c.b >= 0) response_of(response(bodies, c.b), c.normal, cross(c.arm_b, c.normal), other, turn_b);
     normal = normal + other;
 #else
     normal = c.normal;
@@ -605,9 +661,10 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
 }
 #else
 // The same; contacts may be of several pairs of bodies. In each round every lane shows one contact.
-__device__ void share_out_pair(const Lanes& lanes, ContactRoom& room, Contact* list, const Real* weights, int first,
-                               int end, const Motion* bodies) {
-    Real totals[SLOTS];
+__device__ void share_out_pair(const Lanes& lanes, Chain& chain, Contact* list, const Real* weights, int first, int end,
+                               const Motion*) {
+    ContactRoom& room = chain.room.collide.contacts;
+    Real totals[LIST_ROOM];
     INNER for (int i = first; i < end; i++) totals[i] = Real(0);
     KEEP_LOOP
     for (int j = first; lanes.any(j < end); j++) {
@@ -615,7 +672,7 @@ __device__ void share_out_pair(const Lanes& lanes, ContactRoom& room, Contact* l
         if (j < end) {
             const Contact& c = list[j];
             Vec normal = none(), turn_a = none(), turn_b = none();
-            unit_response(c, bodies, normal, turn_a, turn_b);
+            unit_response(c, chain, normal, turn_a, turn_b);
             room.first[lanes.lane] = normal;
             room.second[lanes.lane] = turn_a;
             room.third[lanes.lane] = turn_b;

@@ -40,9 +40,16 @@ struct Wrenches {
 #endif
 };
 
-struct Constants {
+struct Weight {
     Real inverse_mass;
     Sym inverse_inertia;  // body axes
+};
+
+#if SHARED
+struct Constants {
+#else
+struct Constants : Weight {
+#endif
     Vec com;              // in the body frame
     Number reach;         // of its spheres from the centre of mass
 #if PAIRED
@@ -84,9 +91,6 @@ struct StepRoom {
     Mat rotations[BODIES];
     Motion motions[BODIES];
     Vec starts[FREES], velocities[FREES], spins[FREES];
-    Number limits[PAIR_ROOM], nears[PAIR_ROOM];  // see `Reach`
-    bool near[PAIR_ROOM], touched[PAIR_ROOM];    // pairs that may touch, and those that do
-    int groups[BODIES];
 };
 #endif
 
@@ -104,7 +108,12 @@ struct Common {  // what the lanes of an environment have in common
 #endif
     Body bodies[BODIES];
     Constants constants[BODIES];
+#if SHARED
+    Weight weights[FREES];
+#endif
+#if DRIVEN
     int cursors[BODIES];
+#endif
 #if LINKS
     Chain chain;
 #endif
@@ -123,6 +132,13 @@ static_assert(sizeof(Environment) <= SHARED_BYTES, "shared_bytes of structure.py
 struct Environment : Common {  // one object, as the compiler allots registers by the order of what is in it
     Own own;
 };
+#endif
+
+// Inverse mass and inertia of a free body.
+#if SHARED
+INLINE const Weight& weight(const Environment& env, int b) { return env.weights[FREE(b)]; }
+#else
+INLINE const Weight& weight(const Environment& env, int b) { return env.constants[b]; }
 #endif
 
 INLINE void load(const Problem& problem, Environment& env, Own& own) {
@@ -188,10 +204,17 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
         Body& body = env.bodies[b];
         Constants& c = env.constants[b];
         at = bodies + 23 * b;
-        c.inverse_mass = table.at(at);
         Sym inertia = {table.at(at + 1), table.at(at + 2), table.at(at + 3),
                        table.at(at + 4), table.at(at + 5), table.at(at + 6)};
+#if SHARED
+        if (is_free(b)) {
+            env.weights[FREE(b)].inverse_mass = table.at(at);
+            env.weights[FREE(b)].inverse_inertia = inertia;
+        }
+#else
+        c.inverse_mass = table.at(at);
         c.inverse_inertia = inertia;
+#endif
         c.com = table.vector(at + 7);
         body.position = table.vector(at + 10);
         Quat quat = {table.at(at + 13), table.at(at + 14), table.at(at + 15), table.at(at + 16)};
@@ -216,7 +239,9 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
             }
 #endif
         }
+#if DRIVEN
         env.cursors[b] = 0;
+#endif
     }
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) own.before[i] = none();

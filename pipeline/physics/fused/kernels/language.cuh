@@ -35,7 +35,7 @@
 #endif
 // The lanes of an environment, and where they show contacts to each other.
 #if SHARED
-#define SHOWN_TO(lanes, env) lanes, (env).chain.room.free.contacts
+#define SHOWN_TO(lanes, env) lanes, (env).chain
 #else
 #define SHOWN_TO(lanes, env) lanes
 #endif
@@ -51,6 +51,17 @@
 #define EACH_SHOWN _Pragma("unroll 8")
 #else
 #define INNER
+#endif
+// The coordinates above one, or that move a link: few, so that one does not wait for the places of those before it.
+#if SHARED && DEPTH <= 8
+#define EACH_ABOVE(k, depth) SPREAD for (int k = 0; k < DEPTH; k++) if (k < (depth))
+#else
+#define EACH_ABOVE(k, depth) for (int k = 0; k < (depth); k++)
+#endif
+#if SHARED && !HOST
+#define SOME _Pragma("unroll 4")
+#else
+#define SOME
 #endif
 // Loops along the trees of the chains, from the roots or towards them: links, or coordinates. Lanes do those of one
 // level at once.
@@ -77,6 +88,11 @@
 #define UP_DOFS(lanes, d) for (int d = DOFS - 1; d >= 0; d--)
 #endif
 #define DEEP (MESHES || HULLS)  // labels have gaps weighted by impulses, where slots may have nothing at the frame
+#if QUEUED
+#define SLOT_OF(contact) (contact)
+#else
+#define SLOT_OF(contact) ((contact) / LANES)
+#endif
 #define PAIR_ROOM (PAIRS > 0 ? PAIRS : 1)  // C++ has no arrays without elements
 // The touching contacts from `first` on, one after another (LISTED), or those that are on, each in its own slot, which
 // keeps them in registers.

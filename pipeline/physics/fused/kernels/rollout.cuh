@@ -8,17 +8,19 @@ INLINE void step(const Problem& problem, Environment& env, Own& own, Real time_a
     EACH_BODY
     DIVIDED(lanes, b, BODIES) {
         const Body& body = env.bodies[b];
-        const Constants& c = env.constants[b];
         rotations[b] = matrix(body.quat);
         Vec velocity = body.velocity, start = body.spin, spin = body.spin;
         motions[b].omega = body.spin;
+#if !SHARED
         motions[b].inverse_mass = Real(0);
         motions[b].inverse_inertia = no_inertia();
-#if LINKS
+#endif
+#if LINKS && !SHARED
         motions[b].columns = 0;
         motions[b].depth = 0;
 #endif
         if (is_free(b)) {
+            const Weight& c = weight(env, b);
             start = c.inverse_inertia * transposed(rotations[b], body.spin);
             motions[b].omega = rotations[b] * start;
             velocity = body.velocity + env.laws[0].step_s * env.gravity;
@@ -26,8 +28,13 @@ INLINE void step(const Problem& problem, Environment& env, Own& own, Real time_a
             apply(problem, env, lanes, b, rotations[b], motions[b].omega, velocity, spin);
             motions[b].omega = rotations[b] * (c.inverse_inertia * transposed(rotations[b], spin));
 #endif
+#if SHARED
+            env.chain.free_masses[FREE(b)] = c.inverse_mass;
+            env.chain.free_inertias[FREE(b)] = turned(rotations[b], c.inverse_inertia);
+#else
             motions[b].inverse_mass = c.inverse_mass;
-#if PAIRED
+#endif
+#if PAIRED && !SHARED
             motions[b].inverse_inertia = turned(rotations[b], c.inverse_inertia);
 #endif
         }
@@ -49,7 +56,7 @@ INLINE void step(const Problem& problem, Environment& env, Own& own, Real time_a
     DIVIDED(lanes, b, BODIES) {
         if (is_free(b)) {
             int f = FREE(b);
-            advance(env.bodies[b], env.constants[b], starts[f], velocities[f], spins[f], env.laws[0].step_s);
+            advance(env.bodies[b], weight(env, b), starts[f], velocities[f], spins[f], env.laws[0].step_s);
         }
 #if DRIVEN
         if (drive_number(b) >= 0 && body_link(b) < 0) drive(problem, env, b, time_after);
@@ -77,7 +84,7 @@ INLINE void write_frame(const Problem& problem, const Environment& env, const La
         Mat R = matrix(body.quat);
         Vec position = body.position, velocity = body.velocity, omega = transposed(R, body.spin);
         if (is_free(b)) {
-            omega = c.inverse_inertia * omega;
+            omega = weight(env, b).inverse_inertia * omega;
             Vec arm = R * c.com;
             position = position - arm;
             velocity = velocity - cross(R * omega, arm);

@@ -225,8 +225,8 @@ def long_chain(links: int) -> Structure:
 def test_environments_of_a_block_are_as_many_as_its_memory_holds() -> None:
     short, middle, endless = (long_chain(links) for links in (3, 10, 150))
     assert [short.on_lanes(lanes).lanes for lanes in (1, 4, 32)] == [1, 4, 32]
-    assert [middle.on_lanes(lanes).lanes for lanes in (1, 4, 32)] == [1, 16, 32]
-    assert middle.on_lanes(4).block_bytes <= SHARED_BYTES < 4 * middle.on_lanes(4).shared_bytes
+    assert [middle.on_lanes(lanes).lanes for lanes in (1, 4, 32)] == [1, 8, 32]
+    assert middle.on_lanes(4).block_bytes <= SHARED_BYTES < 8 * middle.on_lanes(4).shared_bytes
     assert endless.on_lanes(32).lanes == 1 and not endless.on_lanes(32).shared
 
 

@@ -1,0 +1,24 @@
+struct Contact {  // world frame, impulse on body a
+    Vec arm, impulse;
+    Real target, stop_n, stop_t;
+#if LAWS > 1
+    Real friction;
+#endif
+#if SURFACE
+    Real friction, steady_x, steady_y;  // steady: fixed impulses (viscosity)
+    Vec turning;                        // angular impulse of rolling and torsional friction
+#if ELLIPTIC
+    Ellipse ellipse;  // replaces the friction coefficient
+#endif
+#endif
+#if PAIRED
+    Vec normal, arm_b;
+    Real gap;
+    int a, b;  // b: -1 for the ground, -2 for a fixed surface
+#endif
+#if LISTED
+    int slot;  // `SLOT_OF` its number
+#else
+    bool on;
+#endif
+};
