@@ -33,6 +33,8 @@ def _toml_line(text: str, location: tuple) -> int | None:
         if header := _HEADER.fullmatch(line):
             table = _keys(header[2])
             if header[1] == "[[":
+                # what it holds is counted anew
+                counts = {key: n for key, n in counts.items() if key == table or key[: len(table)] != table}
                 counts[table] = counts.get(table, -1) + 1
             place = table = _indexed(table, counts)
         elif assignment := _ASSIGNMENT.match(line):

@@ -10,7 +10,7 @@ from cgwm.pipeline.physics.parameters import Parameter
 from cgwm.pipeline.segments.first_contact_fit import _prior
 from cgwm.pipeline.segments.held_out_gain import HeldOutGain
 from cgwm.pipeline.segments.segment_fit import Linear, Refit, robust_excess
-from cgwm.pipeline.segments.segments import Segments
+from cgwm.pipeline.segments.segments import Segments, _line
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.segmentation import Segment
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -96,3 +96,22 @@ def test_only_wanted_parameters_have_a_prior_in_windows_of_first_contacts() -> N
     centre, information = _prior(parameters, 1, torch.zeros((), dtype=F64))
     torch.testing.assert_close(centre, torch.tensor([0.3, 2.0], dtype=F64).log())
     assert information.tolist() == [pytest.approx(1 / 0.5**2), 0.0]
+
+
+def test_a_line_goes_through_what_counts_of_it() -> None:
+    t = torch.tensor([[0.0, 1.0, 2.0, 4.0], [1.0, 2.0, 3.0, 5.0]], dtype=F64)
+    start, slope = torch.tensor([[1.0, -2.0, 0.5]], dtype=F64), torch.tensor([[0.3, 0.0, -4.0]], dtype=F64)
+    values = (start + t[..., None] * slope).clone()
+    values[0, 2] += 9.0  # does not count
+    weight = torch.ones(2, 4, dtype=F64)
+    weight[0, 2] = 0.0
+    for found, expected in zip(_line(t, values, weight), (start, slope), strict=True):
+        torch.testing.assert_close(found, expected.expand(2, 3))
+    noisy = torch.randn(2, 4, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    found = torch.stack(_line(t, noisy, weight))
+    for k in range(2):
+        kept = weight[k] > 0
+        wanted = torch.as_tensor(np.polyfit(t[k, kept].numpy(), noisy[k, kept].numpy(), 1)[::-1].copy())
+        torch.testing.assert_close(found[:, k], wanted)
+    nothing = _line(t, noisy, torch.zeros_like(weight))
+    assert all(bool((part == 0).all()) for part in nothing)
