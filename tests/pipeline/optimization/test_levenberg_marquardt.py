@@ -70,6 +70,12 @@ def test_priors_are_further_residuals() -> None:
     best = torch.linalg.lstsq(torch.cat((matrix, more)), wanted[:, None]).solution[:, 0]
     found = fitted(prior_information=prior, shared_prior=(centre, held))
     torch.testing.assert_close(torch.cat((found.shared, found.states.flatten())), best, rtol=1e-6, atol=1e-8)
+    # the cost holds the states' prior, of each item its own; that of the parameters is none of the items'
+    cost = (matrix @ best - target).square().sum() + (prior * found.states.square()).sum()
+    told = fitted(prior_information=prior)
+    own = (matrix @ torch.cat((told.shared, told.states.flatten())) - target).square().sum()
+    assert told.cost == pytest.approx(float(own + (prior * told.states.square()).sum()))
+    assert told.cost < float(cost) < float(TARGET.square().sum())
     each = fitted(prior_information=prior.expand(ITEMS, STATES), shared_prior=(centre, held))
     torch.testing.assert_close(each.shared, found.shared)
     # the prior of the parameters is no part of what the residuals say of them
@@ -114,8 +120,8 @@ def test_either_kind_may_be_absent(which: str) -> None:
 
 def test_cauchys_loss_and_its_weight_are_value_and_slope() -> None:
     chi2 = torch.tensor([0.0, 0.5, 4.0, 1e4], dtype=F64, requires_grad=True)
-    loss, weight = robust_loss(chi2, 2.0)
-    torch.testing.assert_close(loss, 4 * torch.log(1 + chi2 / 4))
+    loss, weight = robust_loss(chi2, 3.0)
+    torch.testing.assert_close(loss, 9 * torch.log(1 + chi2 / 9))
     (slope,) = torch.autograd.grad(loss.sum(), chi2)
     torch.testing.assert_close(weight, slope)
     plain, one = robust_loss(chi2.detach(), None)
