@@ -45,6 +45,8 @@ _TIGHT_RATIO = 0.7  # Lowe's test for repeated texture
 _ALIGN_ABOVE = 0.001
 """Standard deviation of an optical centre, as a fraction of the extent of all, above which places of points in the
 photos are aligned to each other: before one is so uncertain that a warning is given."""
+_MIDDLE_STEPS = 3
+"""Most steps of the principal points."""
 _RICHEST_ON_TURNTABLE = "RADIAL"
 """Tangential distortion can hardly be told from a rotation of the camera where the camera always stands alike."""
 
@@ -260,9 +262,13 @@ def _brightness(photo: Path) -> NDArray[np.float32]:
 
 def _with_principal_points(mapped: Mapped, camera_model: str, inputs: Inputs, seed: int) -> Mapped:
     """Return a model whose principal points are off the middle as far as the observations say so."""
-    model = mapped.model()
-    models = estimated(camera_model, model, inputs)
-    return with_principal_points(mapped, principal_points(model, models), inputs.known, seed) if models else mapped
+    models = estimated(camera_model, mapped.model(), inputs)
+    for _ in range(_MIDDLE_STEPS):
+        points = principal_points(mapped.model(), models)
+        if not points:
+            break
+        mapped = with_principal_points(mapped, points, inputs.known, seed)
+    return mapped
 
 
 def _with_exif(

@@ -12,7 +12,7 @@ from .pose_posterior import posterior
 from .reconstruction import Array, SfmModel
 from .turntable_motion import TurntableMotion
 
-UNCERTAIN_CENTER = 0.0015
+UNCERTAIN_CENTER = 0.0012
 """Standard deviation of an optical centre, as a fraction of the extent of all, above which a warning is given."""
 
 

@@ -35,6 +35,8 @@ PRINCIPAL_STD = 0.003
 """Standard deviation of a coordinate of the principal point about the middle, as a fraction of the picture's diagonal:
 a lens is centred on a sensor to some tenths of a millimetre."""
 
+_STILL = 0.3
+"""Standard deviations by which a principal point is off before it is moved."""
 _SIMILARITY = 7
 """Numbers of a similarity transform."""
 _FLOOR = 1e-9
@@ -72,8 +74,10 @@ def posterior(
     principal = {camera: column + LENS_PARAMETERS[models[camera]] for camera, column in focal.items()}
     size = len(reduced.matrix)
     design = np.eye(size) if motion is None else _design(model, motion, size)
-    scale = 1.0 / (SHARED_VARIANCE * _noise_px(model, lengths, design.shape[1]) ** 2)
-    information, pull = scale * reduced.matrix, scale * reduced.right
+    weights = _weights(lengths)
+    scale = 1.0 / (SHARED_VARIANCE * _noise_px(model, lengths, weights, design.shape[1]) ** 2)
+    # the loss is curved less than its weights say, by sum w^2 / sum w for Cauchy's; steps are longer by as much
+    information, pull = scale * reduced.matrix, scale * reduced.right * (weights.sum() / (weights**2).sum())
     for camera, column in principal.items():
         offset, std = _about_the_middle(model, camera)
         information[column : column + PRINCIPAL, column : column + PRINCIPAL] += np.eye(PRINCIPAL) / std**2
@@ -96,19 +100,20 @@ def posterior(
 
 
 def principal_points(model: SfmModel, models: Map[str, str]) -> dict[str, Array]:
-    """Return the most probable principal point [px], shape (2,), of each camera whose intrinsics were estimated.
+    """Return the most probable principal points [px], shape (2,), by camera, where they are not those of the model yet.
 
     Args:
         model: The model, about at the minimum of its adjustment with the principal points that it has.
-        models: COLMAP's camera model of each of these cameras.
+        models: COLMAP's camera model of each camera whose intrinsics were estimated.
     """
     found, points = posterior(model, models), {}
     for camera, column in found.principal_columns.items():
-        own = slice(column, column + PRINCIPAL)
+        own, one = slice(column, column + PRINCIPAL), model.cameras[camera]
+        step, variance = found.step[own], found.variances[own]
         # none is less certain than what is known of it without a photo, but for rounding where nothing is determined
-        if (found.variances[own] <= 1.001 * _about_the_middle(model, camera)[1] ** 2).all():
-            one = model.cameras[camera]
-            points[camera] = np.array([one.cx, one.cy]) + found.step[own]
+        known = (variance <= 1.001 * _about_the_middle(model, camera)[1] ** 2).all()
+        if known and (step**2 > _STILL**2 * variance).any():
+            points[camera] = np.array([one.cx, one.cy]) + step
     return points
 
 
@@ -119,15 +124,20 @@ def _about_the_middle(model: SfmModel, camera: str) -> tuple[Array, float]:
     return offset, PRINCIPAL_STD * float(np.hypot(one.width, one.height))
 
 
-def _noise_px(model: SfmModel, lengths: Array, numbers: int) -> float:
+def _weights(lengths: Array) -> Array:
+    """Return the weights of errors [px] under the loss of the adjustment."""
+    return 1.0 / (1.0 + (lengths / (LOSS_SCALE * noise_px(lengths))) ** 2)
+
+
+def _noise_px(model: SfmModel, lengths: Array, weights: Array, numbers: int) -> float:
     """Return the noise of a coordinate [px] of observations as the loss weighs them; infinite where all are used up.
 
     Args:
         model: The model.
         lengths: Its reprojection errors [px], shape (observation,).
+        weights: Their weights.
         numbers: Free numbers of poses and intrinsics.
     """
-    weights = 1.0 / (1.0 + (lengths / (LOSS_SCALE * noise_px(lengths))) ** 2)
     seen = np.unique(np.concatenate([points for _, points in model.observations.values()]))
     used = (numbers - _SIMILARITY + 3 * len(seen)) / (2 * len(lengths))
     freedom = 2 * float(weights.sum()) * (1.0 - used)

@@ -97,7 +97,7 @@ def _seen_by(model: SfmModel) -> SfmModel:
 
 
 def test_a_principal_point_off_the_middle_is_found_as_far_as_the_observations_tell_it() -> None:
-    true = _noisy(_seen_by(_with_middle(_scene(points=300), 324.0, 240.0)), 0, noise_px=0.1)
+    true = _noisy(_seen_by(_with_middle(_scene(points=300), 324.0, 240.0)), 0)
     # an adjustment that takes it to be in the middle turns the cameras instead
     turn = np.eye(4)
     turn[:3, :3] = rotation_about([0, 1, 0], 4.0 / 600.0)
@@ -105,8 +105,9 @@ def test_a_principal_point_off_the_middle_is_found_as_far_as_the_observations_te
     found = principal_points(replace(_with_middle(true, 320.0, 240.0), T_cam_world=turned), MODELS)["photos"]
     at = posterior(true, MODELS).principal_columns["photos"]
     stds = np.sqrt(posterior(true, MODELS).variances[at : at + 2])
-    assert stds[0] < 0.5 and stds[1] > 1.5  # all cameras look down on one ring: its tilt takes the place of the row
-    assert found[0] == pytest.approx(324.0, abs=3 * stds[0]) and found[1] == pytest.approx(240.0, abs=stds[1])
+    assert stds[0] < 1.2 and stds[1] > 2.0  # all cameras look down on one ring: its tilt takes the place of the row
+    assert 322.5 < found[0] == pytest.approx(324.0, abs=2 * stds[0]) and found[1] == pytest.approx(240.0, abs=stds[1])
+    assert principal_points(_scene(points=300), MODELS) == {}  # in the middle already
 
 
 def test_a_photo_of_its_own_camera_does_not_tell_its_principal_point() -> None:
