@@ -21,6 +21,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -98,12 +99,16 @@ def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
     fingers = ("ff", "mf", "rf", "th")
     names = [f"{finger}j{k}" for finger in fingers for k in range(4)]
     parts = [f"{finger}_{part}" for finger in fingers for part in ("base", "proximal", "medial", "distal")]
+    moved = [[f"{finger}_{part}" for part in ("proximal", "medial", "distal")] for finger in fingers]
+    touching = [pair for one, other in combinations(moved, 2) for pair in product(one, other)]
+    touching += [(part, "palm") for finger in moved for part in finger if part != "th_proximal"]
     task = HandTask.model_validate(
         {
             "robot": {
                 "file": "envs/xmls/allegro_right_hand.xml",
                 "quat_wxyz": (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)),
                 "friction": dict.fromkeys(parts, FINGER_FRICTION),
+                "touching": touching,
             },
             "start": {
                 "position_m": (float(place[0]), float(place[1]), start_m[2] + given.lift),
