@@ -119,23 +119,29 @@ def without_rest(whole: Observations, items: Sequence[Segment], noise: Noise) ->
     """Return the segments without those in which nothing moves, except the first in a row: more add no information."""
     kept, resting = [], {}
     for item in items:
-        frames = slice(item.first, item.last + 1)
-        still = True
-        for values, mask, sigma in (
-            (whole.position_m[item.episode, frames], whole.seen[item.episode, frames], noise.position_m),
-            (_turns(whole, item), whole.has_orientation[item.episode, frames], noise.rotation_rad),
-        ):
-            half = len(values) // 2
-            parts = [
-                (values[p] * mask[p, :, None]).sum(0) / mask[p, :, None].sum(0).clamp_min(1.0)
-                for p in (slice(0, half), slice(half, None))
-            ]
-            limit = LIMITS.still * sigma * (2 / half) ** 0.5
-            still &= bool(((parts[1] - parts[0]).abs() < limit).all())
-        resting[item.episode] = resting.get(item.episode, 0) + 1 if still else 0
+        resting[item.episode] = resting.get(item.episode, 0) + 1 if _rests(whole, item, noise) else 0
         if resting[item.episode] <= LIMITS.kept_rests:
             kept.append(item)
     return kept
+
+
+def _rests(whole: Observations, item: Segment, noise: Noise) -> bool:
+    """Return whether no body moves or turns in a segment by more than the noise."""
+    frames = slice(item.first, item.last + 1)
+    seen, turned = whole.seen[item.episode, frames], whole.has_orientation[item.episode, frames]
+    stays = _steady(whole.position_m[item.episode, frames], seen, noise.position_m)
+    return stays and _steady(_turns(whole, item), turned, noise.rotation_rad)
+
+
+def _steady(values: Tensor, mask: Tensor, sigma: float) -> bool:
+    """Return whether values (T, nf, 3) with a mask (T, nf) have the same mean in both halves, to their noise."""
+    half = len(values) // 2
+    parts = [
+        (values[p] * mask[p, :, None]).sum(0) / mask[p, :, None].sum(0).clamp_min(1.0)
+        for p in (slice(0, half), slice(half, None))
+    ]
+    limit = LIMITS.still * sigma * (2 / half) ** 0.5
+    return bool(((parts[1] - parts[0]).abs() < limit).all())
 
 
 def _turns(whole: Observations, item: Segment) -> Tensor:
