@@ -28,7 +28,7 @@ from .effect_selection import SelectionStep, repeats
 from .falsification import Consistency
 from .flight_omnibus import flight_windows, is_significant, worst_omnibus
 from .flight_search import flight_search
-from .flight_selection import FlightSelection, completed, judged
+from .flight_selection import FlightSelection, completed, judged, reconsidered
 from .own_tilt import TILTS, own_tilts
 from .thresholds import THRESHOLDS
 
@@ -216,8 +216,19 @@ class _Search:
         # accelerations of the flights' own that only show beside the effects are part of the errors, too
         if told is None or _sways(told) != _sways(errors) or _differ(chosen, told):
             beside = self.beside(told)
-            return told, law, beside, self.selection(beside)
+            return told, law, beside, self.likelier(beside, self.selection(beside), chosen)
         return replace(told, noise_model=errors.noise_model), law, beside, chosen
+
+    def likelier(self, beside: _Beside, found: FlightSelection, before: FlightSelection) -> FlightSelection:
+        """Return the likelier (by BIC) of two selections: of a search, and of one before it, under other errors.
+
+        A search takes one effect at a time: where two together explain what is left, a third one may come first that
+        imitates both.
+        """
+        if set(before.names) == set(found.names):
+            return found
+        again = reconsidered(beside.prepared, before, self.candidates, beside.scatter)
+        return min(found, again, key=lambda one: one.bic(beside.scatter))
 
     def told(
         self, world: World, errors: SlowErrors | None, tilted: bool = True

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from ..physics.parameters import effect_parameters
 from ..physics.world import World
 from ..segments.candidates import Candidate, base_parameters, without_effect
 from ..segments.prepare import Prepared
@@ -55,6 +57,18 @@ class FlightSelection(NamedTuple):
             return self
         world, flight = _without(self.flight, self.world, names)
         return FlightSelection([step for step in self.steps if step.best.name not in names], world, flight)
+
+    def bic(self, scatter: float) -> float:
+        """Return BIC, up to a constant of the flights; infinite without flight.
+
+        Args:
+            scatter: Factor by which variances exceed those of the noise.
+        """
+        if self.flight is None:
+            return math.inf
+        rows = self.flight.residuals([], self.world.gravity.new_zeros(0), jacobian=False)[0]
+        own = len(effect_parameters(self.world))
+        return float(rows.square().sum()) / scatter + own * math.log(max(float(self.flight.dof.sum()), 2.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +120,17 @@ def _reselected(
     common = [step for step in needed.steps if step.flagged and step.own_std is None]
     own = [step for step in needed.steps if step not in common]
     return FlightSelection(*reselected(prepared, common, own, (needed.world, needed.flight), candidates, scatter))
+
+
+def reconsidered(
+    prepared: Prepared, found: FlightSelection, candidates: Sequence[Candidate], scatter: float
+) -> FlightSelection:
+    """Select the effects of a search again, each beside the others, under the noise that episodes have now."""
+    steps = [step for step in found.steps if step.flagged]
+    if prepared.flight is None or not steps:
+        return found._replace(flight=None)
+    fitted = refit([prepared.flight], found.world, base_parameters(found.world, "flight"))
+    return FlightSelection(*reselected(prepared, steps, [], (fitted.world, fitted.segments[0]), candidates, scatter))
 
 
 def judged(

@@ -158,7 +158,8 @@ def _stretches(times: Tensor) -> list[tuple[int, int]]:
     if len(times) < 2:
         return []
     steps = times.diff()
-    cuts = (steps > LIMITS.gap * steps.median()).nonzero()[:, 0].tolist()
+    longest = max(LIMITS.gap * float(steps.median()), LIMITS.gap_s)
+    cuts = (steps > longest).nonzero()[:, 0].tolist()
     edges = [-1, *cuts, len(times) - 1]
     return [(a + 1, b) for a, b in itertools.pairwise(edges)]
 

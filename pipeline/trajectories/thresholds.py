@@ -176,7 +176,13 @@ class SegmentationThresholds:
         "fewest of a segment: its state uses up the information of two",
         BY_ARGUMENT,
     )
-    gap: float = threshold(2.5, "median frame intervals", "a longer gap ends a segment")
+    gap: float = threshold(2.5, "median frame intervals", "a longer gap ends a segment, if it exceeds `gap_s`, too")
+    gap_s: float = threshold(
+        0.03,
+        "s",
+        "see `gap`: how long a body may be unseen does not depend on the frame rate",
+        "by argument: whether it may have touched something meanwhile is asked of its next move (`move_share`)",
+    )
     still: float = threshold(
         4.0,
         "standard errors",
