@@ -141,6 +141,7 @@ def test_flights_are_searched_again_where_their_own_accelerations_come_or_go(
     monkeypatch.setattr(search, "told", lambda _, __, errors: (errors, None))
     monkeypatch.setattr(search, "beside", lambda _, errors: errors)
     monkeypatch.setattr(search, "selection", lambda _, errors: errors)
+    monkeypatch.setattr(search, "likelier", lambda _, __, found, ___: found)
     monkeypatch.setattr(flight_findings, "_differ", lambda *_: False)
     chosen: Any = SimpleNamespace(world=None, names=["linear_drag"])
     found = search(None, None, ()).settled(errors, errors, chosen)
