@@ -29,7 +29,7 @@ SIGMA, RAMP = (0.1, 1.0), 4.0
 PIECE_S = 0.01
 """Length of commands, and of the steps of predictions [s]."""
 NODES_S = np.linspace(0, HORIZON_S, NODES)
-STEPS_S = PIECE_S * (1 + np.arange(round(HORIZON_S / PIECE_S)))
+STEPS_S = PIECE_S * (1 + np.arange(round(HORIZON_S / PIECE_S), dtype=float))
 PLACE_WEIGHT, TURN_WEIGHT = 50.0, 0.05
 """Costs of squared errors of position [1/m2] and turn [1/rad2], as means over the plan."""
 
@@ -71,7 +71,7 @@ class CemController(HandController):
         wall, cpu = time.perf_counter(), time.process_time()
         acts = max(state.time_s, acts_s or 0.0)
         cost = self._search(state, acts)
-        times = acts + PIECE_S * np.arange(len(STEPS_S) + 1)
+        times = acts + PIECE_S * np.arange(len(STEPS_S) + 1, dtype=float)
         targets = Targets(times_s=times, values_m=np.clip(self.spline(times), self.lower, self.upper))
         self._plan = ControlPlan(
             state_s=state.time_s, acts_s=acts, targets=targets, cost=cost,
