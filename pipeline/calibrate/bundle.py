@@ -141,6 +141,11 @@ def errors_px(model: SfmModel, image: str) -> Array:
     return np.linalg.norm(drawn - pixels, axis=1)
 
 
+def all_errors_px(model: SfmModel) -> Array:
+    """Return the reprojection errors of all observations [px], image by image, shape (observation,)."""
+    return np.concatenate([errors_px(model, image) for image in model.T_cam_world])
+
+
 def moved_lens(camera: SfmCamera, lens: str, step: Array) -> SfmCamera:
     """Return a camera after a step of the free numbers that its camera model has."""
     focals = focal_numbers(lens)

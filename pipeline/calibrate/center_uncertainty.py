@@ -35,10 +35,10 @@ def center_stds(
     return pose_stds(model, models, with_exif, motion)[0]
 
 
-def rotation_stds(
+def pose_stds(
     model: SfmModel, models: Map[str, str], with_exif: Collection[str] = (), motion: TurntableMotion | None = None
-) -> dict[str, float]:
-    """Return the standard deviation of each camera's rotation [rad], after the alignment of `center_stds`.
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return what `center_stds` does, and the standard deviation of each camera's rotation [rad] after that alignment.
 
     Args:
         model: As in `center_stds`.
@@ -46,13 +46,6 @@ def rotation_stds(
         with_exif: As there.
         motion: As there.
     """
-    return pose_stds(model, models, with_exif, motion)[1]
-
-
-def pose_stds(
-    model: SfmModel, models: Map[str, str], with_exif: Collection[str] = (), motion: TurntableMotion | None = None
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return what `center_stds` and `rotation_stds` do, from one covariance; arguments as there."""
     variances = posterior(model, models, with_exif, motion).variances
     sums = variances[: POSE * len(model.T_cam_world)].reshape(-1, 2, 3).sum(2)
     extent = float(np.linalg.norm(np.ptp(model.centers(), axis=0)))

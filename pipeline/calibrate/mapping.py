@@ -6,10 +6,11 @@ thread is used; see `colmap`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Mapping as Map
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pycolmap
@@ -19,6 +20,7 @@ from ...schemas import CameraIntrinsics
 from .colmap import camera_names, count, run
 from .reconstruction import Array, SfmCamera, SfmModel
 
+_Given = TypeVar("_Given")
 _MIN_MODEL_IMAGES = 3
 LOSS_SCALE = 2.0
 """Scale of the Cauchy loss, in standard deviations of a coordinate of the residuals."""
@@ -132,27 +134,40 @@ def with_focal_lengths(
     mapped: Mapped, focals_px: Map[str, float], known: Map[str, CameraIntrinsics], seed: int
 ) -> Mapped:
     """Give cameras of an adjusted model their focal lengths [px], and adjust all but focal lengths again."""
-    copy = pycolmap.Reconstruction(mapped.reconstruction)
-    for identifier, camera in copy.cameras.items():
-        if mapped.names[identifier] in focals_px:
-            values = np.array(camera.params)
-            values[camera.focal_length_idxs()] *= focals_px[mapped.names[identifier]] / camera.mean_focal_length()
-            camera.params = values.tolist()
-    _adjust(copy, _fixed(mapped, known), seed, focal_lengths=False)
-    return Mapped(reconstruction=copy, names=mapped.names)
+
+    def scaled(camera: Any, values: Array, focal_px: float) -> None:
+        values[camera.focal_length_idxs()] *= focal_px / camera.mean_focal_length()
+
+    return _with_numbers(mapped, focals_px, scaled, known, seed, focal_lengths=False)
 
 
 def with_principal_points(
     mapped: Mapped, points_px: Map[str, Array], known: Map[str, CameraIntrinsics], seed: int
 ) -> Mapped:
     """Give cameras of an adjusted model their principal points [px], shape (2,), and adjust all else again."""
+
+    def moved(camera: Any, values: Array, point_px: Array) -> None:
+        values[camera.principal_point_idxs()] = point_px
+
+    return _with_numbers(mapped, points_px, moved, known, seed)
+
+
+def _with_numbers(
+    mapped: Mapped,
+    given: Map[str, _Given],
+    put: Callable[[Any, Array, _Given], None],
+    known: Map[str, CameraIntrinsics],
+    seed: int,
+    focal_lengths: bool = True,
+) -> Mapped:
+    """Put what is given of each camera into its numbers, and adjust a copy of the model again."""
     copy = pycolmap.Reconstruction(mapped.reconstruction)
     for identifier, camera in copy.cameras.items():
-        if mapped.names[identifier] in points_px:
+        if mapped.names[identifier] in given:
             values = np.array(camera.params)
-            values[camera.principal_point_idxs()] = points_px[mapped.names[identifier]]
+            put(camera, values, given[mapped.names[identifier]])
             camera.params = values.tolist()
-    _adjust(copy, _fixed(mapped, known), seed)
+    _adjust(copy, _fixed(mapped, known), seed, focal_lengths=focal_lengths)
     return Mapped(reconstruction=copy, names=mapped.names)
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .bundle import POSE, PRINCIPAL, linearized
+from .bundle import POSE, PRINCIPAL, all_errors_px, linearized
 from .camera_models import LENS_PARAMETERS
 from .focal_prior import EXIF_STD
 from .mapping import LEAST_NOISE_PX, LOSS_SCALE, noise_px
@@ -68,7 +68,7 @@ def posterior(
         with_exif: Those cameras among them whose focal length EXIF data have told, too.
         motion: The turntable that the poses were constrained to, whose axis is z; the numbers are then those of it.
     """
-    lengths = linearized(model, {}).residuals_px
+    lengths = all_errors_px(model)
     equations = linearized(model, models, LOSS_SCALE * noise_px(lengths), principal=True)
     reduced, focal = equations.reduced(), equations.columns
     principal = {camera: column + LENS_PARAMETERS[models[camera]] for camera, column in focal.items()}

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..optimization.least_squares import Policy, descend
 from ..optimization.problem import Box, Point, Problem, Rows
-from .bundle import NormalEquations, ReducedEquations, errors_px, linearized, moved_lens
+from .bundle import NormalEquations, ReducedEquations, all_errors_px, linearized, moved_lens
 from .camera_models import LENS_PARAMETERS
 from .reconstruction import Array, SfmModel
 from .turntable_motion import TurntableMotion
@@ -92,7 +92,7 @@ class _Adjustment(Problem):
         """Return the Cauchy loss of all observations [px^2], infinite where a point is behind a camera that sees it."""
         del rows
         model, _ = self.model_at(point)
-        return self._cost(model, np.concatenate([errors_px(model, image) for image in model.T_cam_world]))
+        return self._cost(model, all_errors_px(model))
 
     def linearised(self, point: Point, rows: Rows) -> _PointsApart:
         """Return the normal equations, with the points apart."""

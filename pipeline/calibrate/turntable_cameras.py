@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .bundle import POSE, errors_px
+from .bundle import POSE, all_errors_px, errors_px
 from .camera_models import LENS_PARAMETERS, focal_numbers, robust_cost, supported
 from .mapping import LOSS_SCALE, noise_px
 from .reconstruction import Array, SfmCamera, SfmModel, VerifiedPair
@@ -75,11 +75,11 @@ def _constrained(model: SfmModel, lenses: Lenses, focals: Focals) -> TurntableCa
     start = turntable_motion(model)
     if start is None:
         return None
-    free = _lengths(model)
+    free = all_errors_px(model)
     noise = noise_px(free)
     turned, motion = start
     # from afar, under a loss as wide as the start is wrong
-    wide = noise_px(_lengths(motion.placed(turned)))
+    wide = noise_px(all_errors_px(motion.placed(turned)))
     if wide > _FAR * noise:
         return None
     richest = _present(lenses[list(lenses)[-1]], turned)
@@ -94,13 +94,13 @@ def _constrained(model: SfmModel, lenses: Lenses, focals: Focals) -> TurntableCa
 def _beaten(model: SfmModel, motion: TurntableMotion, free_px: Array, noise: float) -> bool:
     """Return whether free cameras, with errors `free_px` (observation,), are worth their further numbers."""
     saved = POSE * len(model.T_cam_world) - motion.numbers
-    gain = robust_cost(_lengths(model), noise) - robust_cost(free_px, noise)
+    gain = robust_cost(all_errors_px(model), noise) - robust_cost(free_px, noise)
     return bool(gain > saved * np.log(2 * len(free_px)))
 
 
 def _with_lens(model: SfmModel, motion: TurntableMotion, lenses: Lenses, focals: Focals) -> TurntableCameras:
     """Return a model with the simplest lens that no richer one beats: free cameras may have needed a rich one."""
-    noise = noise_px(_lengths(model))
+    noise = noise_px(all_errors_px(model))
     tried = {}
     for name, wanted in lenses.items():
         own = _present(wanted, model)
@@ -108,7 +108,7 @@ def _with_lens(model: SfmModel, motion: TurntableMotion, lenses: Lenses, focals:
         weights = _weights(model, own, focals, noise)
         tried[name] = adjusted(plain, motion, own, LOSS_SCALE * noise, weights, _FINE_STEPS)
     cameras = len(_present(lenses[list(lenses)[-1]], model))
-    taken = supported([(name, _lengths(one)) for name, (one, _) in tried.items()], cameras)
+    taken = supported([(name, all_errors_px(one)) for name, (one, _) in tried.items()], cameras)
     best, moved = tried[taken]
     return TurntableCameras(best, moved, taken)
 
@@ -131,18 +131,18 @@ def _completed(
     found: TurntableCameras, pairs: Sequence[VerifiedPair], cameras: Map[str, str], lenses: Lenses, focals: Focals
 ) -> TurntableCameras:
     """Return a model with the photos that its rings have room for, where these do not contradict it."""
-    before = noise_px(_lengths(found.model))
+    before = noise_px(all_errors_px(found.model))
     model, motion = with_places(found.model, found.motion, pairs, cameras)
     if motion is found.motion:
         return replace(found, model=_with_error(found.model))
     wanted = _present(lenses[found.camera_model], model)
     for limit in (None, *_KEEP_WITHIN):
-        noise = noise_px(_lengths(model))
+        noise = noise_px(all_errors_px(model))
         if limit is not None:
             model = _without_outliers(model, limit * noise)
         weights = _weights(model, wanted, focals, noise)
         model, motion = adjusted(model, motion, wanted, LOSS_SCALE * noise, weights, _FINE_STEPS)
-    if noise_px(_lengths(model)) > _WORSE * before:
+    if noise_px(all_errors_px(model)) > _WORSE * before:
         return replace(found, model=_with_error(found.model))
     best = _with_lens(model, motion, lenses, focals)
     return replace(best, model=_with_error(best.model))
@@ -168,9 +168,5 @@ def _without_outliers(model: SfmModel, limit_px: float) -> SfmModel:
     return replace(model, points=model.points[many], colors=model.colors[many], observations=observations)
 
 
-def _lengths(model: SfmModel) -> Array:
-    return np.concatenate([errors_px(model, image) for image in model.T_cam_world])
-
-
 def _with_error(model: SfmModel) -> SfmModel:
-    return replace(model, reprojection_error_px=float(_lengths(model).mean()))
+    return replace(model, reprojection_error_px=float(all_errors_px(model).mean()))

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cgwm.pipeline.calibrate import attempts, pose_posterior
-from cgwm.pipeline.calibrate.center_uncertainty import center_stds, rotation_stds
+from cgwm.pipeline.calibrate.center_uncertainty import center_stds, pose_stds
 from cgwm.pipeline.calibrate.metric_scale import umeyama
 from cgwm.pipeline.calibrate.pose_posterior import posterior, principal_points
 from cgwm.pipeline.calibrate.reconstruction import SfmModel, Similarity
@@ -74,7 +74,7 @@ def test_equals_the_scatter_of_adjustments(monkeypatch: pytest.MonkeyPatch) -> N
             for name, pose in fitted.T_cam_world.items()
         ]
         turned.append(Rotation.from_matrix(np.array(turns)).as_rotvec())
-        stated_turns.append(list(rotation_stds(fitted, MODELS).values()))
+        stated_turns.append(list(pose_stds(fitted, MODELS)[1].values()))
     scatter = np.sqrt((np.array(off) ** 2).sum(2).mean(0)) / extent
     # 40 draws: the standard error of a root mean square of three directions is about 7 %
     assert np.median(stated, 0) == pytest.approx(scatter, rel=0.3)
@@ -119,7 +119,7 @@ def test_a_photo_of_its_own_camera_does_not_tell_its_principal_point() -> None:
     prior = pose_posterior.PRINCIPAL_STD * 800.0
     stds = {name: np.sqrt(found.variances[at : at + 2]) for name, at in found.principal_columns.items()}
     assert stds["other"][0] > 2 * stds["photos"][0] and (stds["other"] < prior).all()
-    turns = rotation_stds(two, models)
+    turns = pose_stds(two, models)[1]
     assert turns["03.jpg"] == max(turns.values())
     assert np.degrees(turns["03.jpg"]) > np.degrees(stds["other"].min() / 600.0) * 0.5
 
