@@ -23,7 +23,7 @@ from ..segments.segment_fit import Refit, refit
 from ..segments.segments import Segments
 from ..trajectories.innovations import WHITE
 from .evidence import Evidence, prior_odds
-from .falsification import repetition
+from .falsification import repetitions
 from .score_test import ScoreTest, canonical_correlation, gain_by_episode, score_test
 from .session_scales import linearize_beside_scales
 from .thresholds import THRESHOLDS
@@ -114,7 +114,8 @@ def select_next(
     done = _refitted_shortlist(significant, flight, world, linear, kept, variants, dispersion)
     every = list(range(linear.base, len(linear.parameters)))
     own = [linear.columns(_variant(e, kept, variants).parameters) for e in done]
-    done = [replace(e, repetition=repetition(linear, one, dispersion, every)) for e, one in zip(done, own, strict=True)]
+    repeated = repetitions(linear, own, dispersion, every)
+    done = [replace(e, repetition=found) for e, found in zip(done, repeated, strict=True)]
     if not done:
         return SelectionStep(tuple(evidence), tuple(evidence[:1]), False)
     names = {e.name: e for e in done}

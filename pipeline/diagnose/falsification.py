@@ -166,29 +166,46 @@ class Repetition:
 def repetition(
     linear: Linearization, columns: Sequence[int], dispersion: float, beside: Sequence[int] = ()
 ) -> Repetition:
-    """Test an effect beside the scatter of its parameters between episodes.
+    """Test an effect as `repetitions` does, whose arguments these are."""
+    return repetitions(linear, [columns], dispersion, beside)[0]
+
+
+def repetitions(
+    linear: Linearization, effects: Sequence[Sequence[int]], dispersion: float, beside: Sequence[int] = ()
+) -> list[Repetition]:
+    """Test effects, each beside the scatter of its parameters between episodes.
 
     Args:
-        linear: Linearization of the segments with the effect.
-        columns: Columns of the effect's parameters.
+        linear: Linearization of the segments with the effects.
+        effects: Columns of the parameters of each effect.
         dispersion: Factor by which variances exceed those of the noise.
         beside: Columns of all effects whose scatter tells the usual one; none where the noise model alone tells it.
     """
     names = [int(one) for one in np.unique(linear.episode)]
-    parts = (linear, *(linear.without_episode(one) for one in names if len(names) > 1))
-    found = [_beside_scatter(one, columns, dispersion, beside) for one in parts]
-    return Repetition(*found[0], max((p_value for _, p_value in found[1:]), default=1.0))
+    parts = [linear, *(linear.without_episode(one) for one in names if len(names) > 1)]
+    usual = [_usual(one, dispersion, beside) for one in parts]
+    tests = []
+    for columns in effects:
+        found = [_beside_scatter(*one, columns, dispersion) for one in zip(parts, usual, strict=True)]
+        tests.append(Repetition(*found[0], max((p_value for _, p_value in found[1:]), default=1.0)))
+    return tests
+
+
+def _usual(linear: Linearization, dispersion: float, beside: Sequence[int]) -> tuple[float, float]:
+    """Return the usual scatter of effects between episodes, and for how many degrees of freedom it counts."""
+    counts = LIMITS.model_counts
+    if not beside:
+        return 1.0, counts
+    q, dof = _scatter(linear, beside, dispersion)
+    # what a sum of squares falls below its expectation by is chance
+    return max(1.0, (counts + q) / (counts + dof)), LIMITS.effects_count
 
 
 def _beside_scatter(
-    linear: Linearization, columns: Sequence[int], dispersion: float, beside: Sequence[int]
+    linear: Linearization, expected: tuple[float, float], columns: Sequence[int], dispersion: float
 ) -> tuple[float, float]:
-    """Return the scatter between episodes, and the p-value of an effect beside it."""
-    counts, usual = LIMITS.model_counts, 1.0
-    if beside:
-        # what a sum of squares falls below its expectation by is chance
-        q, dof = _scatter(linear, beside, dispersion)
-        usual, counts = max(1.0, (counts + q) / (counts + dof)), LIMITS.effects_count
+    """Return the scatter between episodes, and the p-value of an effect beside it and the usual one."""
+    usual, counts = expected
     q, dof = _scatter(linear, columns, dispersion)
     scatter = max(1.0, (counts * usual + q) / (counts + dof))
     test = score_test(linear, columns, dispersion=dispersion)
