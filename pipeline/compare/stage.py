@@ -170,9 +170,9 @@ def _with_short_predictions(
     worlds, contacts = [], []
     known: list[State] = []
     with one_torch_thread(), progress(desc="compare: short predictions", total=len(models), unit="model") as bar:
+        flown = after_release(episodes, prepared.released_s)
         for _, model in models:
             # group-specific parameters come from the fit or from the same frames as the fitted states
-            flown = after_release(episodes, prepared.released_s)
             world = World.from_model(model)
             worlds.append(with_fitted_groups(world, flown, model.file, capture.groups, prepared.noise))
             contacts.append(contact_fit(worlds[-1], episodes, prepared, bodies, known))

@@ -232,16 +232,18 @@ class World:
         solid = [k for k, body in enumerate(self.bodies) if body.radii.shape[-1] > 0]
         moving = [k for k in solid if self.moves(k)]
         within = {name for chain in self.chains for name in chain.within}
-        outer = [k for k in moving if self.bodies[k].name not in within]
+        inner = {k for k in solid if self.bodies[k].name in within}
+        outer = [k for k in moving if k not in inner]
         on_ground = [] if self.ground_normal is None else [(i, -1) for i in outer]
         on_surfaces = [(i, -2 - s) for i in outer for s in range(len(self.surfaces))]
-        return on_ground + on_surfaces + self._between(solid, moving)
+        return on_ground + on_surfaces + self._between(solid, moving, inner)
 
-    def _between(self, solid: Sequence[int], moving: Sequence[int]) -> list[tuple[int, int]]:
-        """Return the pairs of solid bodies that can touch each other, of which one at least moves: that one first."""
+    def _between(self, solid: Sequence[int], moving: Sequence[int], inner: set[int]) -> list[tuple[int, int]]:
+        """Return the pairs of solid bodies that can touch each other, of which one at least moves: that one first.
+
+        Those that are `inner` touch nothing but links of their chain.
+        """
         chain = {k: self.chain_of(k) if self.chains else -1 for k in solid}
-        within = {name for one in self.chains for name in one.within}
-        inner = {k for k in solid if self.bodies[k].name in within}
         own = {frozenset(pair) for one in self.chains for pair in one.touching}
         names = self.body_names
         apart = [
