@@ -41,6 +41,7 @@ from store import Store, timed
 from tabletop.capture import TASKS, Task
 from tabletop.engines import ENGINES, JUDGES, refusal
 from tabletop.objects import load_item
+from tabletop.plan import TEST_FRAMES
 
 TESTS = 10
 ENGINE = "mujoco"
@@ -74,10 +75,13 @@ class Work:
     folder: Path
     seed: int
     device: str
+    psnr_every: int = 1
+    """Frames of test videos that are looked at: every so manyth; 0: none."""
 
     def capture(self, task: str, obj: str, material: str, engine: str = ENGINE) -> Path:
-        """Return the directory of a capture."""
-        return self.folder / ("" if engine == ENGINE else engine) / f"{obj}_{material}_{task}"
+        """Return the directory of a capture, which has no other frames of test videos than are looked at."""
+        name = f"{obj}_{material}_{task}" + ("" if self.psnr_every == 1 else f"_{self.psnr_every}")
+        return self.folder / ("" if engine == ENGINE else engine) / name
 
     def splats(self, task: str, obj: str) -> Path:
         """Return the directory of a model without physics."""
@@ -94,7 +98,8 @@ class Work:
             from tabletop import make_capture
 
             path.parent.mkdir(parents=True, exist_ok=True)
-            make_capture(path, obj, material, cast(Task, task), self.seed, TESTS, engine=engine)
+            every = self.psnr_every or TEST_FRAMES
+            make_capture(path, obj, material, cast(Task, task), self.seed, TESTS, engine=engine, tests_every=every)
 
     def make_splats(self, task: str, obj: str, material: str, engine: str = ENGINE) -> None:
         """Fit the spheres of an object to the photos of one of its captures."""
@@ -139,7 +144,6 @@ def run(
     store: Store,
     names: dict[str, Sequence[str]],
     pool: Executor,
-    psnr_every: int,
     captures: int | None = None,
     workers: int = 1,
     seconds: float = float("inf"),
@@ -154,7 +158,6 @@ def run(
         store: Takes the results, as they come.
         names: Which tasks, objects, materials, engines and rows are wanted.
         pool: Who works.
-        psnr_every: Compare every so manyth frame of the test videos; 0: none.
         captures: So many captures of every engine and task, see `drawn`; None for all.
         workers: How many steps run at once.
         seconds: No step begins later.
@@ -179,10 +182,10 @@ def run(
             continue
         capture = once(cell, partial(_capture_step, work, store, jobs, cell))
         splats = once(cell[:2], partial(Step, work.make_splats, lambda cell=cell: cell, (capture,)))
-        reference = [_measuring(store, job, (capture, splats), psnr_every) for job in jobs if job.row == REFERENCE]
+        reference = [_measuring(store, job, (capture, splats), work.psnr_every) for job in jobs if job.row == REFERENCE]
         steps += reference
         needs = (capture, splats, *reference)
-        steps += [_measuring(store, job, needs, psnr_every) for job in jobs if job.row != REFERENCE]
+        steps += [_measuring(store, job, needs, work.psnr_every) for job in jobs if job.row != REFERENCE]
     return run_steps(pool, steps, workers, seconds)
 
 
@@ -288,10 +291,10 @@ def main() -> int:
         if unknown:
             parser.error(f"--{key}: {unknown[0]!r} is none of {', '.join(legal)}")
     if not given.table:
-        work = Work(given.folder.resolve(), given.seed, given.device)
+        work = Work(given.folder.resolve(), given.seed, given.device, given.psnr_every)
         with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
             first = [one.strip() for one in given.first.split(",") if one.strip()]
-            left = run(work, store, names, pool, given.psnr_every, given.captures, given.workers, given.seconds, first)
+            left = run(work, store, names, pool, given.captures, given.workers, given.seconds, first)
         print(f"{left} steps are left.", file=sys.stderr)
     print(engine_table(store.results(), names) if given.by_engine else table(store.results(), names, given.seed))
     return 0

@@ -43,6 +43,7 @@ def make_capture(
     photos: int = 48,
     overwrite: bool = False,
     engine: str = "mujoco",
+    tests_every: int = 1,
 ) -> Path:
     """Make a capture; the same arguments give the same bytes.
 
@@ -62,6 +63,8 @@ def make_capture(
         overwrite: Replace what is at `folder`.
         engine: Whose motions are the truth, one of `ENGINES`. Natural time and damping ratio of truth.json are those
             that its contacts were made from; only MuJoCo has them as such.
+        tests_every: Frames of test videos that are drawn, see `Set`. One of a scanned object takes 0.16 s, and no
+            contender sees one.
 
     Returns:
         `folder` as a path.
@@ -79,7 +82,7 @@ def make_capture(
     plan, rejected = plan_capture(item, obj, material, task, seed, tests, engine)
     print(f"{obj} {material} {task} {engine}: draws left out: {rejected or 'none'}", flush=True)
     with new_directory(Path(folder), "capture", overwrite) as directory:
-        stage = build_set(plan, photo_size, video_size, photos, item.paint, item.scan, _SAMPLES, _STILL)
+        stage = build_set(plan, photo_size, video_size, photos, item.paint, item.scan, _SAMPLES, _STILL, tests_every)
         record(stage, directory)
         cameras = read_truth(directory).cameras
         (directory / "cameras.json").write_text(cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")

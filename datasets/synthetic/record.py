@@ -88,6 +88,9 @@ class Set:
     """Rays along and across a video's pixel on which surfaces meet, at each moment of an exposure."""
     still: float = 0.0
     """Bodies that have moved by no more than this, in metres and entries of quaternions, are not drawn anew."""
+    tests_every: int = 1
+    """Of test videos the first two frames and every so manyth from the second on are drawn; those between repeat them:
+    the frames that `VideoErrors` with that number looks at."""
 
 
 def build_set(
@@ -99,6 +102,7 @@ def build_set(
     smooth: bool = False,
     samples: int = 3,
     still: float = 0.0,
+    tests_every: int = 1,
 ) -> Set:
     """Build what is filmed; the sizes [px] and the number of photos change nothing else about it.
 
@@ -111,6 +115,7 @@ def build_set(
         smooth: Whether the object's many facets are to look like one smooth surface at their seams.
         samples: See `Set`.
         still: See `Set`.
+        tests_every: See `Set`.
     """
     rng = np.random.default_rng([plan.seed, 4])
     markers, lamp = draw_markers(rng), draw_lamp(rng)
@@ -139,6 +144,7 @@ def build_set(
         gains=gains,
         samples=samples,
         still=still,
+        tests_every=tests_every,
     )
 
 
@@ -191,11 +197,11 @@ def film(scene: Set, camera_name: str, episode: EpisodePlan, still: Floats, out:
     images.mkdir(parents=True)
     masks.mkdir(parents=True)
     key = zlib.crc32(f"{camera_name}/{episode.name}".encode())
-    drawn: Array | None = None
+    every, drawn = scene.tests_every if episode.split == "test" else 1, None
     colours, label = still, np.zeros(still.shape[:2], np.uint8)
     for frame in range(episode.frame_count):
         poses = _moments(episode.motion, frame / plan.frame_rate)
-        if drawn is None or np.abs(poses - drawn).max() > scene.still:
+        if drawn is None or ((frame - 1) % every == 0 and np.abs(poses - drawn).max() > scene.still):
             colours, label = frame_of(scene, camera, episode.motion, frame / plan.frame_rate, still)
             drawn = poses
         rng = np.random.default_rng([plan.seed, 10, key, frame])

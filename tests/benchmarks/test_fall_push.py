@@ -49,7 +49,8 @@ def bench():
 def work(bench, tmp_path_factory):
     """A folder with the capture of a falling box, with two test episodes, and its splats."""
     folder = tmp_path_factory.mktemp("fall_push")
-    capture = folder / "box_wood_fall"
+    made = bench.fall_push.Work(folder, 0, "cpu", 0)
+    capture = made.capture("fall", "box", "wood")
     make_scene("fall", capture, photo_size=(128, 96), video_size=(96, 72), photos=16)
     (capture / "cameras.json").write_text(read_truth(capture).cameras.model_dump_json())
     manifest = Capture.open(capture).manifest.model_copy(update={"splits": {"train": ("000",), "test": TESTS}})
@@ -57,7 +58,7 @@ def work(bench, tmp_path_factory):
     small = {"iterations": 80, "image_size": 96, "max_body_spheres": 300, "max_scene_spheres": 600}
     config = SplatConfig(device="cpu", max_collision_spheres=60, turntable=False, **small)
     fit(capture, folder / "models" / "box_fall", stage="sg-gs", splat_config=config)
-    return bench.fall_push.Work(folder, 0, "cpu")
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -158,10 +159,10 @@ def test_results_are_stored_and_taken_up_again(bench, work, tmp_path, monkeypatc
     names = NAMES | {"rows": tuple(rows)}
     path = tmp_path / "results.jsonl"
     with ThreadPoolExecutor(1) as pool:
-        bench.fall_push.run(work, bench.store.Store("x", path), names, pool, 0)
+        bench.fall_push.run(work, bench.store.Store("x", path), names, pool)
         assert len(calls) == 2
         again = bench.store.Store("x", path)
-        bench.fall_push.run(work, again, names, pool, 0)
+        bench.fall_push.run(work, again, names, pool)
         assert len(calls) == 2
         other = bench.store.Store("x", path)
         monkeypatch.setenv("CGWM_COMMIT", "def")
@@ -182,7 +183,7 @@ def test_a_budget_needs_its_reference(bench, work, tmp_path, monkeypatch):
     monkeypatch.setattr(bench.fall_push, "ROWS", {"rival": bench.rows.Row(bench.zeros.Frozen, 1.0)})
     with ThreadPoolExecutor(1) as pool, pytest.raises(SystemExit, match="budget"):
         store = bench.store.Store("x", tmp_path / "results.jsonl")
-        bench.fall_push.run(work, store, NAMES | {"rows": ("rival",)}, pool, 0)
+        bench.fall_push.run(work, store, NAMES | {"rows": ("rival",)}, pool)
 
 
 def test_in_mujoco_a_driven_body_follows_its_command_and_pushes(bench):
