@@ -24,7 +24,8 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,9 @@ from cgwm.pipeline.control.horizon import Array
 from cgwm.pipeline.control.solvers import Solution
 from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, NotConvergedError, Pose, Provenance
 from hand_cem import CemController
+from numpy.typing import ArrayLike
 from processor_clock import charge_processors
-from store import Store
+from store import Store, timed
 
 HALF_M, MASS_KG, ROUNDING_M = 0.03, 0.108, 0.0003
 FRICTION, TIP_FRICTION = 0.2, 0.7
@@ -50,6 +52,8 @@ HOME = {
     "mf_dip": 0.25, "rf_mcp": 0.5, "rf_rot": 0.75, "rf_pip": 0.75, "rf_dip": 0.25, "th_cmc": 0.65, "th_axl": 0.9,
     "th_mcp": 0.75, "th_ipl": 0.6,
 }  # fmt: skip
+UNFINISHED, NOTED_S = "unfinished", 5.0
+Note = Callable[[dict[str, Any]], object]
 PLACE_M, ROOT_WXYZ = (0.0, 0.03, 0.1), (0.0, 0.9961947, 0.0, -0.0871557)
 
 
@@ -130,27 +134,50 @@ class Hold:
 
 
 class Limited:
-    """A plant that stops at a time of the machine.
+    """A plant that stops at a time of the machine, and stores what was reached until now.
+
+    A row is stored with each goal and with every 5 s of the plant, so that a run that is killed is not lost.
 
     Args:
         plant: The plant.
+        controller: The controller, which is told each goal.
         end_s: The time [s], as of `time.monotonic`.
+        note: Takes the figures until now.
     """
 
-    def __init__(self, plant: HandScenePlant, end_s: float) -> None:
-        self.reset, self._plant, self._end_s = plant.reset, plant, end_s
+    def __init__(self, plant: HandScenePlant, controller: HandController, end_s: float, note: Note) -> None:
+        self.reset, self._plant, self._end_s, self._note = plant.reset, plant, end_s, note
         self.cut = False
+        self._time_s, self._noted_s, self._goals = 0.0, 0.0, -1  # the first goal is given at the start
+        self._aim, controller.aim = controller.aim, self.aim
+
+    def aim(self, goal_wxyz: ArrayLike) -> None:
+        """Pass a goal to the controller."""
+        self._goals += 1
+        self._aim(goal_wxyz)
+        if self._goals:
+            self._store()
 
     def advance(self, target_rad: Array, interval_s: float) -> HandTruth:
         """See `HandPlant`."""
         self.cut = time.monotonic() > self._end_s
         if self.cut:
             raise NotConvergedError("the time is up.")
+        self._time_s += interval_s
+        if self._time_s - self._noted_s >= NOTED_S:
+            self._store()
         return self._plant.advance(target_rad, interval_s)
 
+    def _store(self) -> None:
+        self._noted_s = self._time_s
+        self._note({"ended": UNFINISHED, "time_s": round(self._time_s, 2), "goals": self._goals})
 
-def measure(name: str, task: HandTask, seed: int, clock: str, device: str, end_s: float) -> dict[str, Any]:
+
+def measure(
+    name: str, task: HandTask, seed: int, given: argparse.Namespace, end_s: float, note: Note
+) -> dict[str, Any]:
     """Return the figures of one run."""
+    clock, device = given.clock, given.device
     if name == "cem":
         controller = CemController(cube(), task)
     else:
@@ -161,7 +188,7 @@ def measure(name: str, task: HandTask, seed: int, clock: str, device: str, end_s
     if clock == "cpu":
         charge_processors(controller)
     before = os.getloadavg()[0]
-    plant = Limited(HandScenePlant(controller.hand), end_s)
+    plant = Limited(HandScenePlant(controller.hand), controller, end_s, note)
     gc.collect()
     gc.freeze()  # what is there before the run is never garbage: no plan waits for its being looked at
     found = run_hand(controller, plant, seed, "ideal" if clock == "ideal" else "real")
@@ -245,7 +272,10 @@ def main() -> None:
                     return
                 kind = f"{given.device}, {given.plant}" if given.plant else given.device
                 key = f"{name}, {given.clock}, {given.hz:g} Hz, {size}, {kind}/{seed}"
-                store.result(key, lambda n=name, s=seed: measure(n, task, s, given.clock, given.device, end_s))
+                known = store.known(key)
+                if known is None or known["ended"] == UNFINISHED:
+                    note = partial(store.add, key)
+                    store.add(key, timed(lambda n=name, s=seed, x=note: measure(n, task, s, given, end_s, x)))
 
 
 if __name__ == "__main__":
