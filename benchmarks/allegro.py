@@ -28,16 +28,16 @@ from typing import Any
 import numpy as np
 import torch
 from cgwm.datasets.models.model import Model
-from cgwm.datasets.shapes.ply import Splats
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant
 from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
-from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, Pose, Provenance
+from cgwm.schemas import ContactParameters, HandTask
+from known_object import known_object
 from store import Store
 
 mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs
-FRICTION, FINGER_FRICTION = 0.5, 1.0
+FRICTION, FINGER_FRICTION, CONTACT_TIME_S = 0.5, 1.0, 0.02
 JOINTS_RAD = (
     0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26,
 )  # fmt: skip
@@ -74,18 +74,10 @@ def model_of(scene: Path, corners: int) -> Model:
     else:
         points = found.geom_size[geom] * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     points = points @ turn.reshape(3, 3).T + found.geom_pos[geom]
-    centers, radii = rounded_hull(points, corners)
     inertia = inertial.reshape(3, 3) @ np.diag(found.body_inertia[body]) @ inertial.reshape(3, 3).T
-    xx, yy, zz, xy, xz, yz = (float(inertia[k]) for k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
-    thing = BodyModel(
-        name="object", motion="free", mass_kg=float(found.body_mass[body]), inertia_kg_m2=(xx, yy, zz, xy, xz, yz),
-        com_m=tuple(found.body_ipos[body].tolist()), convex=True,
-        photo_pose=Pose(position_m=(0.0, 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
-    )  # fmt: skip
-    contact = ContactParameters(friction=FRICTION, contact_time_s=0.02, damping_ratio=1.0)
-    file = ModelFile(bodies=(thing,), contact=contact, provenance=Provenance(capture="none"))
-    spheres = Splats(centers, radii / 2, np.full(len(radii), 0.95), np.full((len(radii), 3), 0.5))
-    return Model(root=None, file=file, collision={"object": spheres})
+    contact = ContactParameters(friction=FRICTION, contact_time_s=CONTACT_TIME_S, damping_ratio=1.0)
+    balls = rounded_hull(points, corners)
+    return known_object(balls, float(found.body_mass[body]), inertia, found.body_ipos[body], contact)
 
 
 def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> HandTask:

@@ -33,14 +33,14 @@ from typing import Any
 import numpy as np
 import torch
 from cgwm.datasets.models.model import Model
-from cgwm.datasets.shapes.ply import Splats
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
 from cgwm.pipeline.control.horizon import Array
 from cgwm.pipeline.control.solvers import Solution
-from cgwm.schemas import BodyModel, ContactParameters, HandTask, ModelFile, NotConvergedError, Pose, Provenance
+from cgwm.schemas import ContactParameters, HandTask, NotConvergedError
 from hand_cem import CemController
+from known_object import known_object
 from numpy.typing import ArrayLike
 from processor_clock import charge_processors
 from store import Store, timed
@@ -61,15 +61,9 @@ def cube() -> Model:
     """Return the model of the cube, with the numbers of the scene."""
     inner = HALF_M - ROUNDING_M
     corners = np.array([(x, y, z) for x in (-inner, inner) for y in (-inner, inner) for z in (-inner, inner)])
-    moment = MASS_KG * 2 / 3 * HALF_M**2
-    body = BodyModel(
-        name="object", motion="free", mass_kg=MASS_KG, inertia_kg_m2=(moment, moment, moment, 0.0, 0.0, 0.0),
-        com_m=(0.0, 0.0, 0.0), photo_pose=Pose(position_m=PLACE_M, quat_wxyz=(1.0, 0.0, 0.0, 0.0)), convex=True,
-    )  # fmt: skip
     contact = ContactParameters(friction=FRICTION, contact_time_s=0.004, damping_ratio=1.0)
-    file = ModelFile(bodies=(body,), contact=contact, provenance=Provenance(capture="none"))
-    spheres = Splats(corners, np.full(8, ROUNDING_M / 2), np.full(8, 0.95), np.full((8, 3), 0.5))
-    return Model(root=None, file=file, collision={"object": spheres})
+    inertia = MASS_KG * 2 / 3 * HALF_M**2 * np.eye(3)
+    return known_object((corners, np.full(8, ROUNDING_M)), MASS_KG, inertia, np.zeros(3), contact)
 
 
 def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
