@@ -173,7 +173,8 @@ def _hand(task: HandTask) -> Articulation:
         hand = read_articulation(task.folder / task.robot.file).welded()
     except InputDataError as error:
         found = f"{task.source}: [robot] file: {error.found}"
-        raise InputDataError(found, error.allowed, error.todo) from error
+        todo = error.todo or "correct the path, which is relative to the task's folder."
+        raise InputDataError(found, error.allowed, todo) from error
     if not hand.joints:
         raise InputDataError(
             f"{task.source}: [robot] file: {hand.path} has no joint that moves.", "a hand with hinges or slides."

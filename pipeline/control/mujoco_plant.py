@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -174,7 +175,7 @@ def _parts(found: TaskWorld) -> list[Mesh]:
     parts = []
     for name in found.task.plant.meshes:
         path = found.task.folder / name
-        mesh = read_mesh(path)
+        mesh = _read_part(found.task.source, path)
         volume, hull = mass_properties(mesh, path).volume_m3, float(ConvexHull(mesh.vertices).volume)
         if hull > (1 + CONVEX_EXCESS) * volume:
             raise InputDataError(
@@ -189,3 +190,11 @@ def _parts(found: TaskWorld) -> list[Mesh]:
 
 def _text(values: Any) -> str:
     return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values)))
+
+
+def _read_part(source: str, path: Path) -> Mesh:
+    try:
+        return read_mesh(path)
+    except InputDataError as error:
+        todo = "correct [plant] meshes; the files are relative to the task's folder."
+        raise InputDataError(f"{source}: [plant] meshes: {error.found}", error.allowed, todo) from error

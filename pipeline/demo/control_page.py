@@ -39,15 +39,21 @@ def control_demo_html(result: ControlDemoResult, webm: bytes) -> str:
         f'<p class="verdict">{text(result.verdict)}</p>',
         paragraph(
             f"Photos and one short video of a {result.family.replace('_', ' ')} gave a model of its shape, its look "
-            "and its friction. With this model a finger plans its pushes, 30 times a second; they act on another "
+            "and its contacts. With this model a finger plans its pushes, 30 times a second; they act on another "
             "simulator, MuJoCo, with the true mesh and the true friction, which the model never saw."
         ),
         _film(webm),
         section("Runs", _runs(found.runs), paragraph(_speed(result))),
         section(
             "What the video gave",
-            table(["parameter", "estimate", "95 % interval", "truth", "unit"], [_row(p) for p in result.parameters]),
-            paragraph("The true values are those of the simulator that made the capture; the fit does not see them."),
+            table(
+                ["parameter", "estimate", "95 % interval", "truth", "unit", "state"],
+                [_row(p) for p in result.parameters],
+            ),
+            paragraph(
+                "The true values are those of the simulator that made the capture; the fit does not see them. What is "
+                "not observable stays near its prior: one push hardly shows it."
+            ),
         ),
         section(
             "Go on",
@@ -98,10 +104,12 @@ def _speed(result: ControlDemoResult) -> str:
 def _row(compared: ComparedParameter) -> list[str]:
     parameter = compared.parameter
     span = parameter.interval_95
+    state = text(parameter.state.replace("_", " "))
     return [
         parameter.name,
         number(parameter.estimate),
-        parameter.state.replace("_", " ") if span is None else f"{number(span[0])} to {number(span[1])}",
+        "" if span is None else f"{number(span[0])} to {number(span[1])}",
         number(compared.true_value),
         unit_text(parameter.unit),
+        f'<span class="bad">{state}</span>' if parameter.state in ("on_bound", "not_observable") else state,
     ]

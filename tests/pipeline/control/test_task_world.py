@@ -120,6 +120,12 @@ def test_a_mesh_that_is_not_convex_is_refused(tmp_path: Path) -> None:
         MujocoPlant(task_world(MODEL, task))
 
 
+def test_a_mesh_that_is_missing_is_refused_by_the_name_of_its_field(tmp_path: Path) -> None:
+    task = push_task(str(tmp_path / "T"), plant={"kind": "mujoco", "meshes": ["none.obj"]})
+    with pytest.raises(InputDataError, match=r"T: \[plant\] meshes: .*none\.obj: no such file"):
+        MujocoPlant(task_world(MODEL, task))
+
+
 FAULTS = {
     "[limits.joints]\nx = [-1, 1]\nz = [0, 1]": "limits: the robot has no joint 'z'; its joints are x, y",
     "[limits.joints]\nx = [-1, 1]\nyy = [0, 1]": "limits: the robot has no joint 'yy'; its joints are x, y. "
