@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from ..runtime import kernel_build
-from .composite_reference import TileLists, composite
+from . import composite_host, composite_reference
+from .composite_reference import TileLists
 from .rasterize import Raster, rasterize
 from .tiles import Tiles, tile_pairs
 
@@ -85,7 +86,8 @@ def render(
 
     Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn if its centre lies
     in front of the camera by more than its scale, and its position is finite. float32 tensors on CUDA are rendered by
-    the kernels of `rasterize`, all others (and where the kernels cannot run) by plain torch, with the same result.
+    the kernels of `rasterize`, those on a CPU by torch and the program of `composite_host`, all others (and where
+    neither can run) by plain torch, with the same result.
 
     Args:
         means: Centres [m], world frame, shape (N, 3), or (C, N, 3) where they differ by camera (moving bodies).
@@ -198,7 +200,7 @@ def _draw_in_torch(
     tile_size: int,
     median: bool,
 ) -> RenderOutput:
-    """Render in plain torch, in tiles, without a background."""
+    """Render in torch, in tiles, without a background."""
     camera_count, scales, opacities, features = scene.viewmats.shape[0], scene.scales, scene.opacities, scene.features
     local = scene.means @ scene.viewmats[:, :3, :3].transpose(1, 2) + scene.viewmats[:, None, :3, 3]
     tiles = Tiles.make(scene.Ks, scene.distortion, scene.width, scene.height, tile_size)
@@ -226,7 +228,7 @@ def _draw_in_torch(
         min_alpha=min_alpha,
         min_transmittance=min_transmittance,
     )
-    values, alpha, middle = composite(coefficients, channels, lists, median)
+    values, alpha, middle = _composite(coefficients, channels, lists, median)
     alone = None
     if scene.groups:
         with torch.no_grad():
@@ -254,7 +256,15 @@ def _alone(coefficients: Tensor, tile_ids: Tensor, chosen: Tensor, lists: TileLi
     """Return the alpha (T, P) of a subset of the pairs, as if the other pairs did not exist."""
     counts = torch.bincount(tile_ids[chosen], minlength=lists.counts.shape[0])
     subset = replace(lists, starts=counts.cumsum(0) - counts, counts=counts)
-    return composite(coefficients[chosen], coefficients[chosen, :1], subset)[1]
+    return _composite(coefficients[chosen], coefficients[chosen, :1], subset)[1]
+
+
+def _composite(
+    coefficients: Tensor, features: Tensor, lists: TileLists, median: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Composite by the compiled program where it runs, else in torch; see `composite_reference.composite`."""
+    twin = composite_host if composite_host.supported(features) else composite_reference
+    return twin.composite(coefficients, features, lists, median)
 
 
 def _coefficients(centres: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:

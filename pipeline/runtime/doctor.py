@@ -214,7 +214,7 @@ def _zstd_fault() -> str:
 
 def _renderer(cuda: bool) -> str:
     if not cuda:
-        return "torch, in tiles"
+        return "torch, in tiles" if compiler() is None else "one program, compiled at run time, in tiles"
     reason = unavailable()
     return "CUDA kernels, compiled at run time" if reason is None else f"torch, in tiles: {reason}"
 

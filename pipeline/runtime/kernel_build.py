@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import importlib
 import logging
 import os
+import platform
 import shutil
 import subprocess
 import tempfile
@@ -15,10 +17,21 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from ...schemas import UsageError
+
 # torch is imported in the functions that need it, because `doctor` asks for the compiler where torch may be missing
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
+
+HOST_FLAGS = ("-std=c++14", "-O3", "-shared", "-fPIC", "-pthread", "-w", "-ffp-contract=off", "-fno-math-errno")
+HOST_FLAGS += ("-fno-trapping-math",)
+"""Options of the C++ compiler: no reordering of sums, and no instructions of this processor only, as others read the
+cache too. The headers of C++14 are read in a third of the time of those of C++17.
+"""
+HOST_BUILD_S = 120.0
+"""Time limit of the C++ compiler [s]."""
+NO_COMPILER = "there is no C++ compiler (g++, clang++ or c++)"
 
 
 @cache
@@ -126,6 +139,45 @@ def compiler_version() -> str | None:
         return None
     version = subprocess.run([command, "-dumpversion"], capture_output=True, text=True, check=False).stdout.strip()
     return f"{Path(command).name} {version}".strip()
+
+
+@cache
+def host_unavailable() -> str | None:
+    """Return why C++ programs cannot be built and loaded here; None where they can."""
+    if compiler() is None:
+        return NO_COMPILER
+    try:
+        host_library('extern "C" int answer() { return 42; }')
+    except (OSError, subprocess.SubprocessError) as error:
+        message = error.stderr if isinstance(error, subprocess.CalledProcessError) else ""
+        return f"the C++ compiler {compiler()} failed: {(message or str(error)).strip().splitlines()[-1]}"
+    return None
+
+
+def host_library(source: str, flags: tuple[str, ...] = HOST_FLAGS) -> ctypes.CDLL:
+    """Return the library of a C++ source, built now or by an earlier process.
+
+    Args:
+        source: The source.
+        flags: Options of the compiler.
+
+    Raises:
+        UsageError: If there is no compiler.
+    """
+    command = compiler()
+    if command is None:
+        raise UsageError(f"{NO_COMPILER}.", todo="install one, or call the function that needs none.")
+
+    def build(work: Path) -> Path:
+        program, library = work / "program.cpp", work / "program.so"
+        program.write_text(source, encoding="utf-8")
+        steps = [command, *flags, str(program), "-o", str(library)]
+        environment = os.environ | {"TMPDIR": str(work)}
+        subprocess.run(steps, check=True, capture_output=True, text=True, timeout=HOST_BUILD_S, env=environment)
+        return library
+
+    recipe = "\n".join((command, platform.machine(), str(Path(command).stat().st_mtime_ns), *flags, source))
+    return built(recipe, ".so", build, lambda library: ctypes.CDLL(str(library)))
 
 
 T = TypeVar("T")

@@ -7,19 +7,13 @@ hundred operations on small tensors, each of which is dominated by its overhead.
 from __future__ import annotations
 
 import ctypes
-import os
-import platform
-import subprocess
 from collections.abc import Mapping
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from ....schemas import UsageError
 from ...runtime import kernel_build
-from ...runtime.kernel_build import compiler
 from ...runtime.resources import kernel_threads
 from ..joint_command import JointCommand
 from ..kinematic import Drive
@@ -32,16 +26,10 @@ from .structure import Structure, kernel_file
 if TYPE_CHECKING:
     from ....datasets.capture.tracks import Track
 
-FLAGS = ("-std=c++14", "-O3", "-shared", "-fPIC", "-pthread", "-w", "-ffp-contract=off", "-fno-math-errno")
-FLAGS += ("-fno-trapping-math", "-fno-tree-slp-vectorize")
-"""Compiler options: no reordering of sums, and no instructions of this processor only, as others read the cache too.
-
-Pairs of neighbouring numbers are not packed into vectors: reading them just after they were written one by one stalls,
-which costs a fifth of the time. The headers of C++14 are read in a third of the time of those of C++17.
+FLAGS = (*kernel_build.HOST_FLAGS, "-fno-tree-slp-vectorize")
+"""Options of the compiler. Pairs of neighbouring numbers are not packed into vectors: reading them just after they were
+written one by one stalls, which costs a fifth of the time.
 """
-BUILD_S = 120.0
-"""Time limit of the compiler [s]."""
-NO_COMPILER = "there is no C++ compiler (g++, clang++ or c++)"
 THREAD_CONTACT_STEPS = 20_000
 """Minimum number of steps times possible contacts per thread: about a millisecond, many times what a thread costs."""
 SUBSTEPS = 10
@@ -56,9 +44,9 @@ def lacking(world: World) -> str | None:
     """Return why the kernel does not support a world on the CPU; None where it does."""
     if world.gravity.device.type != "cpu":
         return f"its tensors are on the device '{world.gravity.device.type}', not on the CPU"
-    if compiler() is None:
-        return NO_COMPILER
-    return world.once(reason_against) or _trial()
+    if kernel_build.compiler() is None:
+        return kernel_build.NO_COMPILER
+    return world.once(reason_against) or kernel_build.host_unavailable()
 
 
 def simulate_on_host(
@@ -94,33 +82,5 @@ def threads_for(rollouts: int, contact_steps: int) -> int:
 
 @cache
 def _library(structure: Structure) -> ctypes.CDLL:
-    return _built(kernel_file("host_prelude") + structure.source(host=True) + kernel_file("host_entry"))
-
-
-@cache
-def _trial() -> str | None:
-    """Return why the compiler cannot build a library that loads; None where it can."""
-    try:
-        _built('extern "C" int answer() { return 42; }')
-    except (OSError, subprocess.SubprocessError) as error:
-        message = error.stderr if isinstance(error, subprocess.CalledProcessError) else ""
-        return f"the C++ compiler {compiler()} failed: {(message or str(error)).strip().splitlines()[-1]}"
-    return None
-
-
-def _built(source: str) -> ctypes.CDLL:
-    """Return the library of a source, built now or by an earlier process."""
-    command = compiler()
-    if command is None:
-        raise UsageError(f"{NO_COMPILER}.", todo="use simulate, which needs none.")
-
-    def build(work: Path) -> Path:
-        program, library = work / "rollout.cpp", work / "rollout.so"
-        program.write_text(source, encoding="utf-8")
-        steps = [command, *FLAGS, str(program), "-o", str(library)]
-        environment = os.environ | {"TMPDIR": str(work)}
-        subprocess.run(steps, check=True, capture_output=True, text=True, timeout=BUILD_S, env=environment)
-        return library
-
-    recipe = "\n".join((command, platform.machine(), str(Path(command).stat().st_mtime_ns), *FLAGS, source))
-    return kernel_build.built(recipe, ".so", build, lambda library: ctypes.CDLL(str(library)))
+    source = kernel_file("host_prelude") + structure.source(host=True) + kernel_file("host_entry")
+    return kernel_build.host_library(source, FLAGS)
