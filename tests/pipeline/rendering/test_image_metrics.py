@@ -39,6 +39,11 @@ def test_loss_weighs_pixels_and_mixes_both_parts() -> None:
     assert float(photometric(a, b, one)) == pytest.approx(float(expected[4, 5] + expected[10, 2]) / 2)
 
 
+def test_derivative_of_the_similarity_equals_differences() -> None:
+    a, b = torch.tensor(np.random.default_rng(2).random((2, 8, 9, 2)))
+    assert torch.autograd.gradcheck(ssim_map, (a.requires_grad_(), b.requires_grad_()))
+
+
 def _ssim(a: np.ndarray, b: np.ndarray, row: int, column: int, half: int) -> float:
     at = np.s_[max(row - half, 0) : row + half + 1, max(column - half, 0) : column + half + 1]
     values = []
