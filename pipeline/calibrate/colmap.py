@@ -1,16 +1,21 @@
 """Adapter of pycolmap: features and matches of photos, repeatable bit for bit.
 
 Every seed is set and extraction, matching and mapping run on one thread each: with automatic thread counts two runs
-on the same photos differ. pycolmap is released often with renamed functions, so only this module and `mapping` import
-it.
+on the same photos differ. Photos and pairs do not depend on each other, so that groups of them run side by side, each
+as it would alone. pycolmap is released often with renamed functions, so only this module and `mapping` import it.
 """
 
 from __future__ import annotations
 
+import shutil
 import signal
+import sqlite3
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,14 +23,18 @@ from typing import Any, TypeVar
 import numpy as np
 import pycolmap
 
+from ...datasets.io.processors import processors
 from ...datasets.io.progress import progress
 from .reconstruction import VerifiedPair
 from .turntable import standing_features
 
+ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
 
 _EXTRACTION_CHUNK = 4
 _MATCHING_BLOCK = 25
+_COPIES = 8
+"""Maximum number of copies of the database, which for hundreds of photos has hundreds of megabytes."""
 _POLL_S = 0.2
 
 pycolmap.logging.minloglevel = 3  # COLMAP's log would drown ours; its results are read from the database
@@ -159,27 +168,43 @@ def _extract(database: Path, root: Path, images: Sequence[SfmImage], settings: S
     options.sift.max_num_features = settings.max_features
     options.sift.peak_threshold = settings.peak_threshold
     pycolmap.Database.open(database).close()
+    for group in _groups(images):
+        # before their features, so that the numbers of the images do not depend on who is done first
+        pycolmap.import_images(
+            database_path=database,
+            image_path=root,
+            image_names=[image.name for image in group],
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            options=_reader(group, -1),
+        )
+    chunks = [chunk for group in _groups(images) for chunk in _chunks(group, _EXTRACTION_CHUNK)]
+
+    def work(place: Path, chunk: Sequence[SfmImage], token: Any) -> None:
+        pycolmap.extract_features(
+            database_path=place,
+            image_path=root,
+            image_names=[image.name for image in chunk],
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=_reader(chunk, _existing_camera(database, chunk[0].name)),
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+            cancellation_token=token,
+        )
+        bar.update(len(chunk))
+
     with progress(range(len(images)), "features", total=len(images), unit="image") as bar:
-        for group in _groups(images):
-            for chunk in _chunks(group, _EXTRACTION_CHUNK):
-                reader = pycolmap.ImageReaderOptions()
-                reader.camera_model = "SIMPLE_PINHOLE"  # features and matches do not depend on it
-                reader.existing_camera_id = _existing_camera(database, group[0].name)
-                if chunk[0].mask is not None:
-                    reader.mask_path = chunk[0].mask
-                run(
-                    pycolmap.extract_features,
-                    settings.seed,
-                    database_path=database,
-                    image_path=root,
-                    image_names=[image.name for image in chunk],
-                    camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=reader,
-                    extraction_options=options,
-                    device=pycolmap.Device.cpu,
-                )
-                bar.update(len(chunk))
+        _shared_out(database, settings.seed, chunks, work, ("keypoints", "descriptors"))
     _name_cameras(database, images)
+
+
+def _reader(images: Sequence[SfmImage], camera: int) -> pycolmap.ImageReaderOptions:
+    """Return options with which images of one camera are read; its number, -1 where it is new."""
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "SIMPLE_PINHOLE"  # features and matches do not depend on it
+    reader.existing_camera_id = camera
+    if images[0].mask is not None:
+        reader.mask_path = images[0].mask
+    return reader
 
 
 def _drop_standing(database: Path) -> None:
@@ -215,24 +240,26 @@ def _match(database: Path, names: Sequence[str], settings: SfmSettings) -> None:
     verification.ransac.random_seed = settings.seed
     verification.ransac.num_threads = 1
     verification.ransac.max_num_trials = settings.verification_trials
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = database.with_suffix(".pairs.txt")
     read = feature_counts(database)
-    blocks = _pair_blocks([name for name in names if name in read])
+    blocks = sorted(_pair_blocks([name for name in names if name in read]), key=len, reverse=True)
     total = sum(map(len, blocks))
+
+    def work(place: Path, block: list[tuple[str, str]], token: Any) -> None:
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = place.with_suffix(".pairs.txt")
+        Path(pairing.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in block), encoding="utf-8")
+        pycolmap.match_image_pairs(
+            database_path=place,
+            matching_options=matching,
+            pairing_options=pairing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+            cancellation_token=token,
+        )
+        bar.update(len(block))
+
     with progress(range(total), "matches", total=total, unit="pair") as bar:
-        for chunk in blocks:
-            Path(pairing.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in chunk), encoding="utf-8")
-            run(
-                pycolmap.match_image_pairs,
-                settings.seed,
-                database_path=database,
-                matching_options=matching,
-                pairing_options=pairing,
-                verification_options=verification,
-                device=pycolmap.Device.cpu,
-            )
-            bar.update(len(chunk))
+        _shared_out(database, settings.seed, blocks, work, ("matches", "two_view_geometries"))
 
 
 def _pair_blocks(names: Sequence[str]) -> list[list[tuple[str, str]]]:
@@ -248,28 +275,80 @@ def run(function: Callable[..., ResultT], seed: int, **arguments: Any) -> Result
 
     COLMAP's generator belongs to the thread, so it is seeded there.
     """
-    token = pycolmap.CancellationToken()
-    outcome: dict[str, Any] = {}
+    return _run_together([partial(function, **arguments)], seed)[0]
 
-    def call() -> None:
+
+def _run_together(functions: Sequence[Callable[..., ResultT]], seed: int) -> list[ResultT]:
+    """Do what `run` does for several functions at once, each in a thread of its own."""
+    token = pycolmap.CancellationToken()
+    outcomes: dict[int, ResultT] = {}
+    errors: list[BaseException] = []
+
+    def call(index: int) -> None:
         try:
             pycolmap.set_random_seed(seed)
-            outcome["value"] = function(**arguments, cancellation_token=token)
+            outcomes[index] = functions[index](cancellation_token=token)
         except BaseException as error:  # raised in the thread of the caller
-            outcome["error"] = error
+            errors.append(error)
+            token.cancel()
 
-    thread = threading.Thread(target=call, daemon=True)
-    thread.start()
+    threads = [threading.Thread(target=call, args=(index,), daemon=True) for index in range(len(functions))]
+    for thread in threads:
+        thread.start()
     try:
-        while thread.is_alive():
-            thread.join(_POLL_S)
+        for thread in threads:
+            while thread.is_alive():
+                thread.join(_POLL_S)
     except BaseException:
         token.cancel()
-        thread.join()
+        for thread in threads:
+            thread.join()
         raise
-    if "error" in outcome:
-        raise outcome["error"]
-    return outcome["value"]
+    if errors:
+        raise errors[0]
+    return [outcomes[index] for index in range(len(functions))]
+
+
+def _shared_out(
+    database: Path, seed: int, items: Iterable[ItemT], work: Callable[[Path, ItemT, Any], None], tables: Sequence[str]
+) -> None:
+    """Do the items of a step on all processors, each of which writes into a copy of the database.
+
+    What an item adds does not depend on the others, nor on who does it.
+
+    Args:
+        database: The database, which has what `work` reads.
+        seed: Seed of each item.
+        items: What is to be done.
+        work: Function that adds the results of an item to a database, given a token that cancels it.
+        tables: The tables to which it adds rows.
+    """
+    pending = deque(items)
+    copies = [database.with_suffix(f".copy{k}.db") for k in range(1, min(processors(), len(pending), 1 + _COPIES))]
+
+    def take(place: Path, cancellation_token: Any) -> None:
+        while pending and not cancellation_token.is_cancelled:
+            try:
+                item = pending.popleft()
+            except IndexError:  # another thread took the last one
+                return
+            pycolmap.set_random_seed(seed)
+            work(place, item, cancellation_token)
+
+    for copy in copies:
+        shutil.copyfile(database, copy)
+    _run_together([partial(take, place) for place in (database, *copies)], seed)
+    for copy in copies:
+        _add_rows(database, copy, tables)
+        copy.unlink()
+
+
+def _add_rows(database: Path, source: Path, tables: Sequence[str]) -> None:
+    """Add the rows of tables of a copy of a database, whose keys the database does not have."""
+    with closing(sqlite3.connect(database)) as opened, opened:
+        opened.execute("ATTACH DATABASE ? AS source", (str(source),))
+        for table in tables:
+            opened.execute(f"INSERT INTO {table} SELECT * FROM source.{table}")
 
 
 def _groups(images: Sequence[SfmImage]) -> list[list[SfmImage]]:

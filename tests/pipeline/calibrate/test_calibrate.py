@@ -7,6 +7,7 @@ import json
 import os
 import sys
 import tempfile
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -199,13 +200,28 @@ def test_the_same_calibration_again_is_kept(scene, report):
     assert (scene / "cameras.json").stat().st_mtime_ns == before
 
 
-def test_two_runs_give_the_same_bytes(scene, tmp_path):
+def test_two_runs_give_the_same_bytes_on_any_number_of_processors(scene, tmp_path, monkeypatch):
     few, written = CalibrateConfig(max_features=400), []
     root = _fresh(scene, tmp_path, photos=4)
-    for overwrite in (False, True):
-        calibrate(root, few, overwrite=overwrite)
+    monkeypatch.setattr(colmap, "_EXTRACTION_CHUNK", 1)
+    monkeypatch.setattr(colmap, "_MATCHING_BLOCK", 2)
+    for processors in (1, 3):
+        monkeypatch.setattr(colmap, "processors", lambda count=processors: count)
+        calibrate(root, few, overwrite=processors > 1)
         written.append((root / "cameras.json").read_bytes())
     assert written[0] == written[1]
+
+
+def test_an_error_in_one_of_several_threads_ends_the_others_and_is_raised():
+    def broken(cancellation_token):
+        raise RuntimeError("a broken photo")
+
+    def waiting(cancellation_token):
+        while not cancellation_token.is_cancelled:
+            time.sleep(0.001)
+
+    with pytest.raises(RuntimeError, match="a broken photo"):
+        colmap._run_together([waiting, broken, waiting], seed=0)
 
 
 def test_without_scale_the_ground_is_the_dominant_plane(scene, report, tmp_path):
