@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -168,6 +169,12 @@ class Raycaster:
         self._surface_of[-1] = -1
         # The last entry is for geometry -1.
         self.label_of = np.array([labels.get(geom, 0) for geom in range(model.ngeom)] + [0], np.uint8)
+
+    def apart(self) -> Raycaster:
+        """Return a renderer of the same bodies that can be placed elsewhere, by another thread."""
+        other = copy(self)
+        other.data = mujoco.MjData(self.model)
+        return other
 
     def place(self, qpos: Array) -> None:
         """Put the bodies at MuJoCo positions `qpos`, shape (nq,)."""

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 import zlib
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +36,7 @@ from ..capture.cameras import Camera
 from ..capture.images import write_image
 from ..capture.manifest import write_manifest
 from ..capture.tracks import write_tracks
+from ..io.processors import processors
 from ..io.progress import progress
 from .dynamics import (
     BODY_GROUP,
@@ -65,11 +70,14 @@ from .truth import TRUTH_FILE, TRUTH_MESH, TrueContact, TrueMotion, TrueObject, 
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
+ItemT = TypeVar("ItemT")
 Vector3 = tuple[float, float, float]
 
 EXPOSURE_STEPS = (-8, 0, 8)
 """Moments, in steps of the simulation, whose mean is one video frame: an exposure of 1/150 s about its time."""
 _AWAY = -100.0  # height at which a body is out of sight, below the mat
+_THREADS = 8
+"""Maximum number of threads that draw; each needs a hundred megabytes."""
 _JPEG_QUALITY_PHOTO, _JPEG_QUALITY_VIDEO = 95, 92
 
 
@@ -152,14 +160,15 @@ def record(scene: Set, out: Path) -> None:
     """Write the whole capture into the empty directory `out`."""
     plan = scene.plan
     take_photos(scene, out)
+    stills = {name: _empty(scene, camera) for name, camera in scene.videos.items()}
     films = [(camera, episode) for camera in scene.videos for episode in plan.episodes]
-    total = sum(episode.frame_count for _, episode in films)
-    with progress(desc="filming", total=total, unit="frame") as bar:
-        for camera in scene.videos:
-            still = _empty(scene, scene.videos[camera])
-            for episode in plan.episodes:
-                film(scene, camera, episode, still, out)
-                bar.update(episode.frame_count)
+    films = sorted(films, key=lambda one: -one[1].frame_count)  # so that all threads end at about the same time
+
+    def work(own: Set, one: tuple[str, EpisodePlan]) -> int:
+        film(own, *one, stills[one[0]], out)
+        return one[1].frame_count
+
+    _draw_all(scene, work, films, "filming", sum(episode.frame_count for _, episode in films), "frame")
     (out / "tracks").mkdir()
     for episode in plan.episodes:
         write_tracks(out / "tracks" / f"{episode.name}.csv", measure_tracks(plan, episode))
@@ -170,16 +179,46 @@ def record(scene: Set, out: Path) -> None:
 
 def take_photos(scene: Set, out: Path) -> None:
     """Write images/ and masks/: the object at rest, no fingertip."""
-    plan, caster = scene.plan, scene.caster
+    plan = scene.plan
     (out / "images").mkdir()
     (out / "masks").mkdir()
-    caster.place(_qpos(plan, plan.photo_qpos))
-    for index, (name, camera) in enumerate(progress(scene.photos.items(), "taking photos", unit="photo")):
+
+    def work(own: Set, one: tuple[int, tuple[str, Camera]]) -> int:
+        index, (name, camera) = one
+        own.caster.place(_qpos(plan, plan.photo_qpos))
         rng = np.random.default_rng([plan.seed, 9, index])
-        view = caster.render(camera)
-        image = expose(view.color, scene.gains["photos"], rng)
+        view = own.caster.render(camera)
+        image = expose(view.color, own.gains["photos"], rng)
         write_image(out / "images" / name, image, _JPEG_QUALITY_PHOTO)
         write_image((out / "masks" / name).with_suffix(".png"), view.label)
+        return 1
+
+    _draw_all(scene, work, list(enumerate(scene.photos.items())), "taking photos", len(scene.photos), "photo")
+
+
+def _draw_all(
+    scene: Set, work: Callable[[Set, ItemT], int], items: Sequence[ItemT], name: str, total: int, unit: str
+) -> None:
+    """Draw what does not depend on each other in a thread of each processor, each with bodies of its own to place.
+
+    Args:
+        scene: What is drawn.
+        work: Draws an item of the scene, and returns how many of `total` that were.
+        items: What is drawn, in the order in which it begins.
+        name: Name of the progress bar.
+        total: Its end.
+        unit: What it counts.
+    """
+    local = threading.local()
+
+    def begun(item: ItemT) -> int:
+        if not hasattr(local, "scene"):
+            local.scene = replace(scene, caster=scene.caster.apart())
+        return work(local.scene, item)
+
+    with progress(desc=name, total=total, unit=unit) as bar, ThreadPoolExecutor(min(processors(), _THREADS)) as pool:
+        for done in pool.map(begun, items):
+            bar.update(done)
 
 
 def film(scene: Set, camera_name: str, episode: EpisodePlan, still: Floats, out: Path) -> None:
