@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=300, help="mutants of the sample")
     parser.add_argument("--seed", type=int, default=1, help="seed of the sample")
     parser.add_argument("--budget", type=float, default=20.0, help="seconds of tests for each mutant")
-    parser.add_argument("--limit", type=float, help="seconds that the map may take; default: until all tests have run")
+    parser.add_argument("--limit", type=float, help="seconds after which the map ends, or no further mutant begins")
     parser.add_argument("--folders", nargs="+", default=list(FOLDERS), help="folders to change")
     parser.add_argument("--without", nargs="*", default=[], help="tests that do not count")
     options, words = parser.parse_known_args()

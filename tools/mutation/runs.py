@@ -138,6 +138,7 @@ def run(root: Path, work: Path, options: argparse.Namespace) -> dict[str, Any]:
     bad: set[str] = set(options.without)
     while True:
         test_all(mutants, results, (tests, by_line, bad), slots, options, kept)
+        mutants = reached(mutants, results)
         kept.write_text(json.dumps(results, indent=1))
         wrong = control(results, tests, slots) - bad
         if not wrong:
@@ -147,6 +148,12 @@ def run(root: Path, work: Path, options: argparse.Namespace) -> dict[str, Any]:
         results = {key: value for key, value in results.items() if value.get("killer") not in wrong}
     shutil.rmtree(work / "slots", ignore_errors=True)
     return report(mutants, results, options.folders, work)
+
+
+def reached(mutants: Sequence[Mutant], results: dict[str, dict[str, Any]]) -> Sequence[Mutant]:
+    """Return the mutants up to the first that was not begun in time; their order is random."""
+    states = [results[key_of(mutant)]["state"] for mutant in mutants]
+    return mutants[: states.index("new")] if "new" in states else mutants
 
 
 def key_of(mutant: Mutant) -> str:
@@ -162,7 +169,10 @@ def test_all(
     options: argparse.Namespace,
     kept: Path,
 ) -> None:
-    """Fill in the results that are missing, or of which tests are left that the budget allows now."""
+    """Fill in the results that are missing, or of which tests are left that the budget allows now.
+
+    After `options.limit` seconds no further mutant begins.
+    """
     tests, by_line, bad = known
     waiting = []
     for mutant in mutants:
@@ -176,6 +186,8 @@ def test_all(
             waiting.append((mutant, names))
     began, total = time.monotonic(), len(waiting)
     while waiting or any(slot.pid for slot in slots):
+        if options.limit is not None and time.monotonic() - began > options.limit:
+            waiting.clear()
         for slot in slots:
             if slot.pid and (over := slot.ended()) is not None:
                 assert slot.mutant is not None
