@@ -74,6 +74,7 @@ print(os.environ["OMP_WAIT_POLICY"], torch.get_num_threads(), os.environ["OPENBL
 GIVEN = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "ACTIVE"}
 
 
+@pytest.mark.evidence
 @pytest.mark.parametrize("given", [{}, pytest.param(GIVEN, marks=pytest.mark.evidence)])
 def test_commands_wait_without_spinning_unless_the_user_says_otherwise(given: dict[str, str]) -> None:
     clean = {name: value for name, value in os.environ.items() if not name.endswith(("_NUM_THREADS", "_POLICY"))}

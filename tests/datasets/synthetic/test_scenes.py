@@ -319,6 +319,7 @@ def test_same_arguments_same_bytes(fall: Path, tmp_path: Path) -> None:
     assert sha256(made("fall", tmp_path / "again", seed=2)) == sha256(fall)
 
 
+@pytest.mark.evidence
 @pytest.mark.parametrize("name", ["fall", pytest.param("push", marks=pytest.mark.evidence)])
 def test_a_plan_repeats_itself(name: str) -> None:
     again = planned.__wrapped__(name, 2)

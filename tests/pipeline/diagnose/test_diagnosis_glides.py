@@ -202,7 +202,7 @@ def test_evidence_tells_what_the_other_episodes_say() -> None:
     [
         ("rolling_resistance", {"c_r": 0.0015}),
         pytest.param("torsional_friction", {"c_t": 0.0012}, marks=pytest.mark.evidence),
-        ("anisotropic_friction", {"a": 0.1}),
+        pytest.param("anisotropic_friction", {"a": 0.1}, marks=pytest.mark.evidence),
     ],
 )
 def test_glides_name_what_is_hidden(name: str, values: dict[str, float]) -> None:
@@ -231,6 +231,7 @@ def limits(prepared: Prepared, world: World, library: list[Candidate] = LIBRARY)
     return {one.candidate.effect.name: one for one in found}
 
 
+@pytest.mark.evidence
 def test_from_the_limit_on_an_effect_is_named() -> None:
     library = [*LIBRARY, *(Candidate(name, load_effect(name)) for name in ("friction_patch", "velocity_restitution"))]
     found = limits(*plain_rolls(), library)
@@ -271,6 +272,7 @@ def test_what_glides_tell_is_the_verdict() -> None:
     assert np.isfinite([before, after]).all()
 
 
+@pytest.mark.evidence
 @pytest.mark.parametrize(
     ("name", "values"),
     [

@@ -228,6 +228,7 @@ def test_impacts_name_what_is_hidden(name: str, values: dict[str, float], fast: 
     assert after.effects[-1].effect.name == name
 
 
+@pytest.mark.evidence
 def test_what_impacts_tell_is_the_verdict() -> None:
     prepared, world = throws({"velocity_restitution": {"r": 0.3}})
     found = find(prepared, world, LIBRARY[:2])
@@ -268,7 +269,8 @@ def impacts_with_rebound(by_slip: float, by_speed: float) -> Impacts:
 
 
 @pytest.mark.parametrize(
-    ("by_slip", "by_speed"), [(0.4, 0.0), pytest.param(0.0, 0.1, marks=pytest.mark.evidence), (0.4, 0.1)]
+    ("by_slip", "by_speed"),
+    [*(pytest.param(*two, marks=pytest.mark.evidence) for two in ((0.4, 0.0), (0.0, 0.1))), (0.4, 0.1)],
 )
 def test_a_rebound_that_falls_with_the_slip_is_no_rebound_that_falls_with_the_speed(
     by_slip: float, by_speed: float

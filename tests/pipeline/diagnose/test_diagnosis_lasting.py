@@ -144,7 +144,7 @@ def test_they_are_no_effect(change: Callable[[Track], Track]) -> None:
 
 
 @pytest.mark.parametrize("change", EACH)
-def test_they_hide_no_effect(change: Callable[[Track], Track]) -> None:
+def test_they_are_in_the_segments_of_flights(change: Callable[[Track], Track]) -> None:
     prepared, world = tossed_ball(change)
     assert prepared.noise_model != WHITE
     blind = replace(prepared, noise_model=NoiseModel())
@@ -152,6 +152,11 @@ def test_they_hide_no_effect(change: Callable[[Track], Track]) -> None:
     items = prepared.flight.items
     slow = [p.segments("flight", world, items) for p in (prepared, blind)]  # pyright: ignore[reportArgumentType]
     assert slow[0].noise_model != WHITE and slow[1].noise_model == WHITE
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("change", [lasting(0.8, 5), smoothed], ids=["lasting", "smoothed"])
+def test_they_hide_no_effect(change: Callable[[Track], Track]) -> None:
     prepared, world = ready("ball", {"linear_drag": {"c": 0.6}}, change)
     found = find(prepared, world, LIBRARY)  # pyright: ignore[reportArgumentType]
     assert [one.evidence.name for one in found.chosen] == ["linear_drag"]

@@ -104,6 +104,7 @@ def test_slow_errors_are_no_effect() -> None:
     assert silent.verdict == "none_missing" and not silent.chosen
 
 
+@pytest.mark.evidence
 def test_a_drag_is_named_beside_slow_errors_with_the_right_number() -> None:
     named = found({"linear_drag": {"c": 0.3}}, seed=2)
     assert [one.evidence.name for one in named.chosen] == ["linear_drag"]
@@ -114,7 +115,7 @@ def test_a_drag_is_named_beside_slow_errors_with_the_right_number() -> None:
     assert replace(named.flight, own_law="heading", steps=()).doubtful
 
 
-@pytest.mark.parametrize("repeats", [False, True])
+@pytest.mark.parametrize("repeats", [pytest.param(False, marks=pytest.mark.evidence), True])
 def test_what_differs_from_episode_to_episode_beside_slow_errors_is_no_missing_physics(repeats: bool) -> None:
     """No model of slow errors is exact: those of smoothed tracks exceed it in every episode, each in its own way."""
     silent = found({}).flight

@@ -13,6 +13,7 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.compare.model_comparison import ComparedModel
 from cgwm.pipeline.compare.short_horizon_errors import short_errors
 from cgwm.pipeline.diagnose import diagnose
+from cgwm.pipeline.diagnose.wording import unseen_motion
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.geometry.rotation import quat_multiply, quat_to_matrix
 from cgwm.pipeline.physics import World
@@ -146,6 +147,16 @@ def test_a_mass_and_an_inertia_that_no_such_body_has_are_told() -> None:
         check_units_and_geometry(world.with_body(0, inertia=100 * body.inertia), episodes, "here")
 
 
+def test_a_verdict_says_which_kind_of_motion_it_does_not_cover() -> None:
+    """The whole sentence of a diagnosis of throws alone is tested by `make evidence`."""
+    flown = SimpleNamespace(contact_items=[], flight=object())
+    assert unseen_motion(flown) == " Only flight was measured, so the verdict does not cover contact."
+    slid = SimpleNamespace(contact_items=[object()], flight=None)
+    assert unseen_motion(slid) == " Only contact was measured, so the verdict does not cover flight."
+    assert unseen_motion(SimpleNamespace(contact_items=[object()], flight=object())) == ""
+
+
+@pytest.mark.evidence
 def test_one_kind_of_motion_alone_is_said_in_the_verdict(tmp_path: Path) -> None:
     truth = world_with("ball", {"magnus_lift": {"s": 0.04}})
     model = write_capture(tmp_path / "high", truth, tosses(truth, 3, count=5, duration_s=0.35, height_m=(2.0, 3.0)))

@@ -57,6 +57,7 @@ def test_all_that_touches_is_found_both_ways_with_the_smooth_distance_of_all_sph
     assert bool((points.slot[:, 0] < count).all()) and int(points.slot.max()) >= count
 
 
+@pytest.mark.evidence
 def test_bodies_that_are_far_apart_cost_nothing_and_near_ones_little() -> None:
     """500 spheres over 500: a resting cube on a cube, against the same with the upper one out of reach."""
     worlds = world_of(cube(500, "low"), cube(500, "high"))
@@ -69,7 +70,7 @@ def test_bodies_that_are_far_apart_cost_nothing_and_near_ones_little() -> None:
     assert spent[0] < 12 * spent[1] + 1.0
 
 
-@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("first", [pytest.param(0, marks=pytest.mark.evidence), 1])
 def test_a_plate_rests_on_a_ball_bigger_than_itself_and_on_two_small_ones(first: int) -> None:
     """Contacts are sought both ways: a large sphere meets the plate at several of its spheres."""
     plate = replace(cube(8, "plate"), centers=0.3 * cube(8).centers)
@@ -83,6 +84,7 @@ def test_a_plate_rests_on_a_ball_bigger_than_itself_and_on_two_small_ones(first:
     assert float(rollout.velocity_m_s[0, -1, first].norm()) < 1e-3
 
 
+@pytest.mark.evidence
 def test_items_that_do_not_touch_change_nothing_for_those_that_do() -> None:
     """Most of a batch in flight: the few that touch are picked out, and move as they would alone."""
     touching = state_of(((0, 0, 0.08), (0.9, 0.3, -0.2, 0.1), (0.5, 0.2, -0.5), (2.0, -3.0, 1.0)))

@@ -86,7 +86,7 @@ def test_a_driven_body_without_a_track_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "until", [0.05, *(pytest.param(until, marks=pytest.mark.evidence) for until in (0.10, 0.3)), 0.16]
+    "until", [*(pytest.param(until, marks=pytest.mark.evidence) for until in (0.05, 0.10, 0.3)), 0.16]
 )
 def test_derivatives_of_a_rollout_match_finite_differences(until: float) -> None:
     """Before, at and after the impact, and at rest."""

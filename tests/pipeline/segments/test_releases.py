@@ -54,7 +54,13 @@ def test_a_throw_that_begins_in_a_hand_is_named_and_left_out() -> None:
     assert firsts == {k: at if k == 2 else 0 for k in range(6)}
 
 
-@pytest.mark.parametrize("effects", [{}, {"spin_damping": {"d": 0.4}}, {"quadratic_drag": {"k": 0.3}}])
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"quadratic_drag": {"k": 0.3}},
+        *(pytest.param(e, marks=pytest.mark.evidence) for e in ({}, {"spin_damping": {"d": 0.4}})),
+    ],
+)
 def test_what_acts_all_along_the_flight_is_no_hand(effects: Mapping[str, Mapping[str, float]]) -> None:
     for seed in range(4):
         episodes = thrown(world_with("cube", effects), seed)

@@ -1,4 +1,7 @@
-"""Bodies are separated from scenes without masks, by a box or by the ground and clustering."""
+"""Bodies are separated from scenes without masks, by a box or by the ground and clustering.
+
+Boxes are tested here with two bodies, which takes the whole way; ground and clustering by `make evidence`.
+"""
 
 import shutil
 from dataclasses import replace
@@ -82,6 +85,7 @@ def found(capture):
     return result
 
 
+@pytest.mark.evidence
 def test_the_ground_and_clustering_find_the_body(capture, found):
     _, true = unmasked(capture)
     assert ious(found.train, true).mean() > 0.93

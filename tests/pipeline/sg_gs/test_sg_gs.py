@@ -18,7 +18,7 @@ from cgwm.schemas import InputDataError, SplatConfig
 WIDTH, HEIGHT, FOCAL = 96, 72, 110.0
 RADIUS, PLACE = 0.05, np.array([0.01, -0.02, 0.05])
 CONFIG = SplatConfig(
-    iterations=30,
+    iterations=24,
     max_body_spheres=200,
     max_scene_spheres=250,
     max_collision_spheres=60,

@@ -51,14 +51,22 @@ def test_the_visual_spheres_are_the_colliding_ones(model):
     assert "to_visual" not in record
 
 
-def test_a_distilled_set_is_compared_with_what_is_seen(tmp_path, quick):
-    result = fit_scene(make_capture(tmp_path / "tiny"), VISUAL.model_copy(update={"collision": "distilled"}))
+def test_a_distilled_set_is_compared_with_what_is_seen_and_nothing_stands_before_it_in_unknown_surroundings(
+    tmp_path, quick
+):
+    make_capture(tmp_path / "tiny")
+    (tmp_path / "tiny" / "capture.toml").write_text('format = "cgwm-capture/1"\n[[bodies]]\nname = "ball"\n')
+    capture = Capture.open(tmp_path / "tiny", check=False)
+    result = fit_scene(capture, VISUAL.model_copy(update={"collision": "distilled"}))
     ball, record = result.bodies["ball"], result.record["ball"]["collision"]
     assert record["set"] == "distilled"
     assert record["spheres"] == len(ball.collision) < len(ball.visual)
     for way in ("to_visual", "from_visual"):
         assert 0 < record[way]["mean_m"] < 0.1 * RADIUS
         assert record[way]["mean_m"] < record[way]["percentile_95_m"] <= record[way]["max_m"]
+    away = np.linalg.norm(np.asarray(result.scene.means) - PLACE, axis=1)
+    assert away.min() > 0.3  # where the cameras are
+    assert any("shell far away" in warning for warning in result.warnings)
 
 
 def test_a_model_whose_visual_spheres_collide_is_simulated_and_written_again(model, tmp_path):
@@ -76,12 +84,3 @@ def test_without_photos_there_is_nothing_visual_to_collide(tmp_path):
     write_manifest(tmp_path / "tracks_only", "shape = { box = { half_extents_m = [0.05, 0.05, 0.05] } }")
     with pytest.raises(UsageError, match="--collision visual: no photos"):
         fit_scene(Capture.open(tmp_path / "tracks_only", check=False), VISUAL)
-
-
-def test_nothing_stands_before_a_body_whose_surroundings_are_unknown(tmp_path, quick):
-    make_capture(tmp_path / "tiny")
-    (tmp_path / "tiny" / "capture.toml").write_text('format = "cgwm-capture/1"\n[[bodies]]\nname = "ball"\n')
-    result = fit_scene(Capture.open(tmp_path / "tiny", check=False), VISUAL)
-    away = np.linalg.norm(np.asarray(result.scene.means) - PLACE, axis=1)
-    assert away.min() > 0.3  # where the cameras are
-    assert any("shell far away" in warning for warning in result.warnings)

@@ -1,19 +1,26 @@
 """`--supervise images` looks at images: tracks, the true mass and the truth beside them change nothing of the model."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.fit import ASSUMED_DENSITY_KG_M3, fit
+from cgwm.pipeline.phys_geo.images.pose_tracking import PoseQuality, PoseTrack, PoseTracker
+from cgwm.pipeline.phys_geo.images.video_episodes import load_video_episode
+from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.runtime.checkpoint import Checkpoint
 from cgwm.schemas import PhysConfig, SplatConfig
 from helpers.pose_search import search_briefly
 from helpers.small_model import HALF, MASS
-from helpers.tiny_capture import model_of, thrown, with_manifest, with_tracks, write_tiny_capture
+from helpers.tiny_capture import model_of, thrown, tiny_model, with_manifest, with_tracks, write_tiny_capture
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = PhysConfig(supervise="images", device="cpu", step_s=0.003, population=8, generations=2, iterations=1)
@@ -56,7 +63,35 @@ def _timeless(value: Any) -> Any:
     return {key: _timeless(part) for key, part in value.items() if not key.startswith("seconds")}
 
 
-@pytest.mark.parametrize("masks", [True, pytest.param(False, marks=pytest.mark.evidence)])
+def test_poses_are_those_of_the_images_though_tracks_are_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That nothing beside the images changes a byte of the model takes two whole fits: `make evidence`."""
+    capture, model = Capture.open(told(tmp_path, frames=LEAST)), tiny_model()
+    nothing = torch.zeros(LEAST)
+    quality = PoseQuality(**{name: nothing for name in PoseQuality.__dataclass_fields__})
+    seen = PoseTrack(
+        position_m=torch.rand(LEAST, 1, 3).double(),
+        quat_wxyz=torch.tensor([0.6, 0.8, 0, 0]).double().expand(LEAST, 1, 4), curvature=nothing, covariance=nothing,
+        loss=nothing, quality=quality, found=nothing == 0, searches=1,
+        rival_nats=math.inf,
+    )  # fmt: skip
+    began = []
+    monkeypatch.setattr(PoseTracker, "run", lambda self: (began.append((self._position, self._quat)), seen)[1])
+    slot = Checkpoint(tmp_path / "checkpoint", {"all": "0"}, every_s=0.0).slot("poses")
+    for again in (False, True):  # found, and of the checkpoint
+        episode = load_video_episode(
+            World.from_model(model), model, capture, "000", {}, slot, tracks_too=False, image_size=64,
+            device=torch.device("cpu"),
+        )  # fmt: skip
+        track = episode.tracks["cube"]
+        np.testing.assert_array_equal(track.position_m, seen.position_m[:, 0])
+        np.testing.assert_array_equal(track.quat_wxyz, seen.quat_wxyz[:, 0])
+        assert again or slot.read(torch.device("cpu")) is not None
+    ((position, quat),) = began  # from the origin, not from where the tracks are
+    assert not position.any() and bool((quat == torch.tensor([1.0, 0, 0, 0])).all())
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("masks", [True, False])
 def test_what_is_not_in_the_images_is_not_looked_at(tmp_path: Path, masks: bool) -> None:
     root = told(tmp_path, masks, LEAST)
     fit(root, tmp_path / "a", "phys-geo", model_of(root), phys_config=CONFIG)
@@ -73,6 +108,7 @@ def test_what_is_not_in_the_images_is_not_looked_at(tmp_path: Path, masks: bool)
     assert [name for name in a if a[name] != b[name]] == []
 
 
+@pytest.mark.evidence
 def test_contact_does_not_depend_on_the_mass_of_a_body_on_the_ground(tmp_path: Path) -> None:
     """Fitted without photos, to masks and the shape, so that the mass is the manifest's or an assumed density's."""
     root = told(tmp_path)

@@ -74,6 +74,7 @@ def plain(capture: Path, known: list[PoseTrack], tmp_path_factory: pytest.TempPa
     return out
 
 
+@pytest.mark.evidence
 def test_spheres_that_touch_are_moved_where_that_is_wanted(
     capture: Path, plain: Path, known: list[PoseTrack], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -91,6 +92,7 @@ def test_spheres_that_touch_are_moved_where_that_is_wanted(
     assert record["moved_most_m"] < 2.5 * (3**0.5 + 1) * MOVED_STD_M
 
 
+@pytest.mark.evidence
 def test_an_interrupted_fit_does_not_look_for_poses_again(
     capture: Path, plain: Path, known: list[PoseTrack], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,7 +143,7 @@ class Scripted(ImageObjective):
     [
         ([1.0, 0.8, 0.9, 0.85, 0.1], 1),
         pytest.param([1.0, 1.1, 1.2, 0.1], 0, marks=pytest.mark.evidence),
-        ([1.0, 0.9, 0.95, 0.8], 3),
+        pytest.param([1.0, 0.9, 0.95, 0.8], 3, marks=pytest.mark.evidence),
     ],
 )
 def test_the_step_is_kept_that_explains_what_was_held_out_best(script: list[float], kept: int) -> None:

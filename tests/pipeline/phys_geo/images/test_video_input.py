@@ -139,18 +139,30 @@ def test_an_object_that_leaves_every_view_for_most_of_the_time(root: Path) -> No
     assert "end_s = 0.100" in said
 
 
-def test_empty_masks_count_as_not_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A hidden body, or a failed segmentation, in some frames: they are left out, and a warning says which."""
+@pytest.fixture
+def partly_hidden(tmp_path: Path) -> Path:
+    """A hidden body, or a failed segmentation, in some frames of each camera."""
     track = thrown()
     assert track.quat_wxyz is not None
     root = write_tiny_capture(tmp_path / "capture", Track(track.time_s[:6], track.position_m[:6], track.quat_wxyz[:6]))
     change_masks(root, "left", lambda k, mask: mask * (k not in (2, 3)))
     change_masks(root, "right", lambda k, mask: mask * (k not in (3, 5)))
-    footage = load_footage(Capture.open(root), EPISODE, 64)
+    return root
+
+
+def test_empty_masks_count_as_not_seen(partly_hidden: Path) -> None:
+    footage = load_footage(Capture.open(partly_hidden), EPISODE, 64)
     assert footage.frame_at.tolist() == [[0, 1, -1, 4, 5], [0, 1, 2, 4, -1]]
     assert np.allclose(footage.times_s * RATE_HZ, [0, 1, 2, 4, 5])
+    warnings = "\n".join(examine_videos(Capture.open(partly_hidden), "train", False))
+    assert "000: left: the masks of 2 of 6 frames show no body that moves freely (frames 2, 3)" in warnings
+    assert "000: right: the masks of 2 of 6 frames show no body that moves freely (frames 3, 5)" in warnings
+
+
+@pytest.mark.evidence
+def test_a_fit_leaves_out_what_is_not_seen_and_says_so(partly_hidden: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     search_briefly(monkeypatch)
-    code, said, out = fit(root)
+    code, said, out = fit(partly_hidden)
     assert code == 0, said
     warnings = "\n".join(read_json(out / "model.json", ModelFile).warnings)
     assert "000: left: the masks of 2 of 6 frames show no body that moves freely (frames 2, 3)" in warnings

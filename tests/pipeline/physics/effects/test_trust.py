@@ -66,15 +66,7 @@ def call(*arguments: object) -> int:
 @pytest.mark.parametrize(
     "arguments",
     [
-        [
-            "synthesize",
-            "MODEL",
-            "--out",
-            "OUT",
-            "--rollouts",
-            "2",
-            *SMALL,
-        ],
+        pytest.param(["synthesize", "MODEL", "--out", "OUT", "--rollouts", "2", *SMALL], marks=pytest.mark.evidence),
         ["export", "MODEL", "--to", "mjcf", "--out", "OUT.xml"],
         ["validate", "MODEL"],
     ],
@@ -99,7 +91,9 @@ def hash_of(model: Path) -> str:
     return hashlib.sha256((model / "effects" / "lift.py").read_bytes()).hexdigest()
 
 
-@pytest.mark.parametrize("consent", [lambda m: m, lambda m: m / "effects" / "lift.py", hash_of])
+@pytest.mark.parametrize(
+    "consent", [pytest.param(lambda m: m, marks=pytest.mark.evidence), lambda m: m / "effects" / "lift.py", hash_of]
+)
 def test_consent_is_to_a_model_a_file_or_a_hash(stranger: Path, consent: Callable[[Path], object]) -> None:
     with pytest.raises(InputDataError, match="nobody has consented"):
         synthesize(stranger, stranger.parent / "ds", TINY)

@@ -114,7 +114,7 @@ def touched(record: Any) -> set[int]:
 @pytest.mark.parametrize(
     ("surfaces", "lanes"),
     [
-        pytest.param(SHAPES, 8, id="shapes-8"),
+        pytest.param(SHAPES, 8, id="shapes-8", marks=pytest.mark.evidence),
         pytest.param(MESHES, 1, id="meshes-1"),
         pytest.param(SHAPES, 1, id="shapes-1", marks=pytest.mark.evidence),
         pytest.param(MESHES, 8, id="meshes-8", marks=pytest.mark.evidence),
