@@ -11,6 +11,13 @@ import pytest
 os.environ["PYTHONSAFEPATH"] = "1"
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Watch the processor time of the tests."""
+    from helpers.processor_time import ProcessorTime
+
+    config.pluginmanager.register(ProcessorTime(config))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _state_home(tmp_path_factory: pytest.TempPathFactory) -> None:
     """What a user consents to is kept in the home directory: not that of the user who runs the tests."""
