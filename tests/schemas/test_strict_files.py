@@ -295,6 +295,7 @@ def test_unusual_work_is_let_through(model: type[FileModel], place: tuple, value
     parse(parse_json(json.dumps(changed(document, place, value)), "f"), model, "f")
 
 
+# In the suite: a measurement of time.
 @pytest.mark.evidence
 def test_a_large_file_is_read_and_refused_in_seconds(tmp_path: Path) -> None:
     path = tmp_path / "cameras.json"

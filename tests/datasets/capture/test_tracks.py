@@ -173,6 +173,7 @@ def test_files_that_are_no_tracks(tmp_path: Path) -> None:
     )
 
 
+# In the suite: a measurement of time.
 @pytest.mark.evidence
 def test_fifty_thousand_rows_are_read_in_seconds(tmp_path: Path) -> None:
     import time

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from cgwm.datasets.io import processors as module
-from cgwm.datasets.io.processors import processor_limits, processors
+from cgwm.datasets.io.processors import processor_limits, processors, use_few_threads
 
 
 @pytest.fixture(autouse=True)
@@ -74,6 +74,18 @@ print(os.environ["OMP_WAIT_POLICY"], torch.get_num_threads(), os.environ["OPENBL
 GIVEN = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "ACTIVE"}
 
 
+@pytest.mark.parametrize("given", ["", "ACTIVE"])
+def test_waiting_is_passive_unless_the_user_says_otherwise(given: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("OMP_WAIT_POLICY", "KMP_BLOCKTIME", "OMP_NUM_THREADS"):
+        monkeypatch.setenv(name, given)  # so that what is set below does not stay
+        if not given:
+            monkeypatch.delenv(name)
+    use_few_threads()
+    assert os.environ["OMP_WAIT_POLICY"] == (given or "PASSIVE") and os.environ["KMP_BLOCKTIME"] == (given or "0")
+    assert os.environ["OMP_NUM_THREADS"] == (given or "64")
+
+
+# In the suite: the test above, in this process.
 @pytest.mark.evidence
 @pytest.mark.parametrize("given", [{}, pytest.param(GIVEN, marks=pytest.mark.evidence)])
 def test_commands_wait_without_spinning_unless_the_user_says_otherwise(given: dict[str, str]) -> None:

@@ -327,6 +327,7 @@ def small(**change: object):
     return Case("secret", "ball", ("magnus_lift",), train=2, test=1, length_s=0.4, seed=7, **change)
 
 
+# In the suite: nothing tells what is hidden in test_mystery.py.
 @pytest.mark.evidence
 def test_a_capture_is_reproducible_and_keeps_its_secret(tmp_path: Path) -> None:
     truth = hidden_effects.make_capture(tmp_path / "a", small())

@@ -208,6 +208,7 @@ def test_centroid_tracks(tmp_path: Path) -> None:
     assert points and all(np.isnan(p.std[3:]).all() and np.isfinite(p.std[:3]).all() for p in points)
 
 
+# In the suite: effects in rollouts and the order of wrenches have laws in test_effects.py and in `diagnose`.
 @pytest.mark.evidence
 def test_an_effect_is_rolled_out_and_what_it_would_explain_is_ordered(tmp_path: Path) -> None:
     """A push of 0.4 m/s2 in long flights: with the effect within the noise, without it the wrench says so."""

@@ -217,6 +217,7 @@ def test_what_flight_alone_cannot_tell_apart_is_stated_whole() -> None:
     assert names(flight_slot({"gravity_scale": {"s": 0.03}})) == lighter - {"buoyancy"}
 
 
+# In the suite: the same steps: what flight alone cannot tell apart, and the next test.
 @pytest.mark.evidence
 def test_contact_separates_a_scale_from_gravity() -> None:
     prepared, world = ready("ball", {"length_scale": {"s": 0.02}}, 3, count=4, duration_s=0.7, height_m=(0.1, 0.25))

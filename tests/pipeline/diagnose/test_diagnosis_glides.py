@@ -231,6 +231,7 @@ def limits(prepared: Prepared, world: World, library: list[Candidate] = LIBRARY)
     return {one.candidate.effect.name: one for one in found}
 
 
+# In the suite: limits grow with the noise in the next test, and glides name what is hidden in the one before.
 @pytest.mark.evidence
 def test_from_the_limit_on_an_effect_is_named() -> None:
     library = [*LIBRARY, *(Candidate(name, load_effect(name)) for name in ("friction_patch", "velocity_restitution"))]
@@ -272,6 +273,7 @@ def test_what_glides_tell_is_the_verdict() -> None:
     assert np.isfinite([before, after]).all()
 
 
+# In the suite: what a glide and a throw together name is tested above, rivals in test_diagnosis.py.
 @pytest.mark.evidence
 @pytest.mark.parametrize(
     ("name", "values"),

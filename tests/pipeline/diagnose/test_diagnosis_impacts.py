@@ -228,6 +228,7 @@ def test_impacts_name_what_is_hidden(name: str, values: dict[str, float], fast: 
     assert after.effects[-1].effect.name == name
 
 
+# In the suite: what impacts name is tested above, how it becomes a verdict by glides.
 @pytest.mark.evidence
 def test_what_impacts_tell_is_the_verdict() -> None:
     prepared, world = throws({"velocity_restitution": {"r": 0.3}})

@@ -154,6 +154,7 @@ def test_they_are_in_the_segments_of_flights(change: Callable[[Track], Track]) -
     assert slow[0].noise_model != WHITE and slow[1].noise_model == WHITE
 
 
+# In the suite: that errors are measured and reach the segments is tested above.
 @pytest.mark.evidence
 @pytest.mark.parametrize("change", [lasting(0.8, 5), smoothed], ids=["lasting", "smoothed"])
 def test_they_hide_no_effect(change: Callable[[Track], Track]) -> None:

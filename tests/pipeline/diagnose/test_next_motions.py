@@ -115,6 +115,7 @@ def test_nothing_is_asked_for_where_everything_is_bounded(known: float, asked: i
     assert set(chosen) == ({0, 1} if asked else set())
 
 
+# In the suite: the next test fits two frictions.
 @pytest.mark.evidence
 def test_a_friction_that_grows_with_the_speed_is_fitted_beside_a_constant_one() -> None:
     """The two cancel each other: joint steps from a viscosity of 0 stalled at a hundredth of it."""

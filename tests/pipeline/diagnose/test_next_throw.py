@@ -314,6 +314,7 @@ class Stranger(Effect):
 """
 
 
+# In the suite: a law as an effect is tested above, that no file is replaced in test_outputs.py.
 @pytest.mark.evidence
 def test_a_law_found_is_saved_and_fitted(tmp_path: Path) -> None:
     file = tmp_path / "hidden.py"
@@ -386,6 +387,7 @@ def test_poses_found_in_videos_serve_as_tracks(tmp_path: Path) -> None:
     assert "--supervise images" in str(error.value)
 
 
+# In the suite: an effect of one's own is loaded and simulated in test_effect_registry.py.
 @pytest.mark.evidence
 def test_an_effect_of_ones_own_is_tested_like_a_built_in_one(tmp_path: Path) -> None:
     file = tmp_path / "my_effect.py"

@@ -104,6 +104,7 @@ def test_slow_errors_are_no_effect() -> None:
     assert silent.verdict == "none_missing" and not silent.chosen
 
 
+# In the suite: each part of the search is tested in this file, a drag by group at its end.
 @pytest.mark.evidence
 def test_a_drag_is_named_beside_slow_errors_with_the_right_number() -> None:
     named = found({"linear_drag": {"c": 0.3}}, seed=2)

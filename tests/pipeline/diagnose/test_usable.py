@@ -156,6 +156,7 @@ def test_a_verdict_says_which_kind_of_motion_it_does_not_cover() -> None:
     assert unseen_motion(SimpleNamespace(contact_items=[object()], flight=object())) == ""
 
 
+# In the suite: the sentence itself is tested above.
 @pytest.mark.evidence
 def test_one_kind_of_motion_alone_is_said_in_the_verdict(tmp_path: Path) -> None:
     truth = world_with("ball", {"magnus_lift": {"s": 0.04}})

@@ -162,6 +162,7 @@ def test_one_toss_gives_back_the_parameters_that_made_it() -> None:
     assert abs(height.estimate) < min(4 * height.std_error, 5e-4)
 
 
+# In the suite: `make same` and the bytes of test_docs_commands.py.
 @pytest.mark.evidence
 def test_two_fits_with_one_seed_are_identical(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(contact_shooting, "SHOT_ITERATIONS", 1)

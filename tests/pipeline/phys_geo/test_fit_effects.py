@@ -68,6 +68,7 @@ def test_drag_is_found_with_the_contact_and_lowers_the_error(monkeypatch: pytest
     assert found.record.to_json()["search_open_loop_m"][-1] < 0.75 * plain.record.to_json()["search_open_loop_m"][-1]
 
 
+# In the suite: constants on their grid are tried in the same way by a diagnosis, test_diagnosis.py.
 @pytest.mark.evidence
 def test_constants_are_tried_on_their_grid_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(first_contact_fit, "ITERATIONS", 1)
@@ -189,6 +190,7 @@ def test_a_fit_that_was_begun_starts_at_the_worlds_numbers(monkeypatch: pytest.M
     assert [generations for _, generations in seen] == [2, 4]
 
 
+# In the suite: what a child takes from its parent is tested in test_earlier_estimates.py.
 @pytest.mark.evidence
 def test_a_child_has_its_own_warnings_and_not_its_parents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The parent's fit of the physics is gone, and so is what it warned of; what its photos showed is still true."""
@@ -232,6 +234,7 @@ def test_effects_of_flight_are_found_in_flights_from_nothing() -> None:
     assert estimate["quadratic_drag.k"] > 0.1 and estimate["wind.w_x"] < -0.5 and estimate["wind.w_y"] > 0.5
 
 
+# In the suite: each of the two is found alone in this file.
 @pytest.mark.evidence
 def test_what_flights_show_stands_beside_effects_of_contact(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(first_contact_fit, "ITERATIONS", 2)

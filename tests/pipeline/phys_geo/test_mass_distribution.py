@@ -198,6 +198,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+# In the suite: the fit and the choice are tested above.
 @pytest.mark.evidence
 def test_a_model_holds_the_mass_distribution_that_was_fitted(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

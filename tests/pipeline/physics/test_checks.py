@@ -90,6 +90,7 @@ def test_a_rollout_that_diverges_names_environment_step_and_start_and_leaves_no_
     assert not list(tmp_path.iterdir())
 
 
+# In the suite: resting bodies of test_laws.py are at half of it.
 @pytest.mark.evidence
 @pytest.mark.parametrize("zeta", [0.05, pytest.param(0.5, marks=pytest.mark.evidence)])
 def test_the_default_law_is_stable_up_to_its_bound(zeta: float) -> None:

@@ -57,6 +57,7 @@ def test_all_that_touches_is_found_both_ways_with_the_smooth_distance_of_all_sph
     assert bool((points.slot[:, 0] < count).all()) and int(points.slot.max()) >= count
 
 
+# In the suite: a measurement of time.
 @pytest.mark.evidence
 def test_bodies_that_are_far_apart_cost_nothing_and_near_ones_little() -> None:
     """500 spheres over 500: a resting cube on a cube, against the same with the upper one out of reach."""
@@ -84,6 +85,7 @@ def test_a_plate_rests_on_a_ball_bigger_than_itself_and_on_two_small_ones(first:
     assert float(rollout.velocity_m_s[0, -1, first].norm()) < 1e-3
 
 
+# In the suite: rollouts of a batch do not see each other in test_physics.py.
 @pytest.mark.evidence
 def test_items_that_do_not_touch_change_nothing_for_those_that_do() -> None:
     """Most of a batch in flight: the few that touch are picked out, and move as they would alone."""

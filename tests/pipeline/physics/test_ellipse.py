@@ -141,6 +141,7 @@ def test_a_slope_holds_along_the_rough_way_alone() -> None:
         assert bool(rollout.contacts.sliding[axis, -1][pressed].all()) == moved
 
 
+# In the suite: the derivatives of this effect agree with differences in test_effects.py.
 @pytest.mark.evidence
 def test_derivatives_agree_with_differences() -> None:
     start = state_of(((0, 0, 0.0295), UP, (0.7, 0.4, 0.0), (0.0, 0.0, 2.0)))

@@ -65,6 +65,7 @@ def test_a_plate_pushed_beside_its_middle_turns_as_a_finely_meshed_one(offset_m:
     assert 0.7 < pushed(offset_m).turn_of_ellipsoid() / expected < 0.95
 
 
+# In the suite: the torque of a plate and what an exponent does to the load are tested below.
 @pytest.mark.evidence
 @pytest.mark.parametrize("exponent", [2.0, pytest.param(4.0, marks=pytest.mark.evidence)])
 def test_a_plate_that_presses_more_at_its_rim_turns_less(exponent: float) -> None:

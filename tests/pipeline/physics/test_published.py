@@ -25,6 +25,7 @@ def test_it_rests_at_the_depth_of_its_formula() -> None:
     assert float(rollout.position_m[0, -1, 0, 2]) - 0.03 == pytest.approx(expected, rel=1e-3)
 
 
+# In the suite: its impulses are tested below.
 @pytest.mark.evidence
 def test_it_creeps_down_a_slope_that_friction_would_hold_by_its_formula() -> None:
     """On a slope of half the friction angle, and of less height than would unload the upper corners."""

@@ -86,6 +86,7 @@ def ratios_db(few, fitted, views):
     ]
 
 
+# In the suite: the next test: it improves.
 @pytest.mark.evidence
 def test_a_fit_improves_by_several_decibels():
     few, fitted, views, _ = adapted(200)

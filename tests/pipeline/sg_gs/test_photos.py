@@ -60,6 +60,7 @@ def _turned(view, twist):
     return replace(view, viewmat=viewmat, camera=camera)
 
 
+# In the suite: the next test: gains follow renders.
 @pytest.mark.evidence
 def test_gains_are_found_with_the_colours_up_to_their_mean(small, truth):
     rng = np.random.default_rng(0)

@@ -39,6 +39,7 @@ def test_the_batch_changes_no_byte(tmp_path: Path) -> None:
     assert len(hashes(write_small_model(tmp_path / "model"), tmp_path, FIVE, sizes=(1, 4))) == 1
 
 
+# In the suite: the same without the kernel above; that rollouts do not see each other in it: test_fused.py.
 @pytest.mark.evidence
 @NEEDS_COMPILER
 @pytest.mark.parametrize("driven", [False, pytest.param(True, marks=pytest.mark.evidence)])
@@ -142,6 +143,7 @@ def test_one_that_diverges_is_drawn_again_and_takes_none_along(tmp_path: Path, m
     other.close()
 
 
+# In the suite: `validate` holds labels to Newton's law in test_validate.py.
 @pytest.mark.evidence
 def test_forces_are_what_changes_momenta(tmp_path: Path) -> None:
     summary = synthesize(write_small_model(tmp_path / "model"), tmp_path / "out", CONFIG)

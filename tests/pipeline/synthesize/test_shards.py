@@ -104,6 +104,7 @@ def flip(file: Path, array: str) -> None:
         stream.write(bytes([byte ^ 0x55]))
 
 
+# In the suite: sharding changes no rollout in test_synthesize.py.
 @pytest.mark.evidence
 def test_any_split_gives_the_same_demos(whole: Path, made: Path) -> None:
     expected = demos(whole / shard_name(0, 1))
@@ -451,6 +452,7 @@ def interrupted(model: Path, out: Path, number: signal.Signals) -> Ended:
         return process.ended(60)
 
 
+# In the suite: a kill and a shard that fails leave them below.
 @pytest.mark.evidence
 def test_an_interrupt_leaves_the_complete_shards(model: Path, made: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"

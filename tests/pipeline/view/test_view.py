@@ -62,6 +62,7 @@ def red_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # Where things are
 
 
+# In the suite: scenes of the model's own motion are tested below.
 @pytest.mark.evidence
 def test_a_recorded_moment_is_what_lies_in_the_file(dataset: Path) -> None:
     reader = RolloutReader(dataset)

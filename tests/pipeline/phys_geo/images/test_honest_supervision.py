@@ -90,6 +90,7 @@ def test_poses_are_those_of_the_images_though_tracks_are_there(tmp_path: Path, m
     assert not position.any() and bool((quat == torch.tensor([1.0, 0, 0, 0])).all())
 
 
+# In the suite: the test above: poses are those of the images.
 @pytest.mark.evidence
 @pytest.mark.parametrize("masks", [True, False])
 def test_what_is_not_in_the_images_is_not_looked_at(tmp_path: Path, masks: bool) -> None:
@@ -108,6 +109,7 @@ def test_what_is_not_in_the_images_is_not_looked_at(tmp_path: Path, masks: bool)
     assert [name for name in a if a[name] != b[name]] == []
 
 
+# In the suite: a contact law is one of times, whatever the mass: tests of physics.
 @pytest.mark.evidence
 def test_contact_does_not_depend_on_the_mass_of_a_body_on_the_ground(tmp_path: Path) -> None:
     """Fitted without photos, to masks and the shape, so that the mass is the manifest's or an assumed density's."""

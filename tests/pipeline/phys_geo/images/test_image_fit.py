@@ -74,6 +74,7 @@ def plain(capture: Path, known: list[PoseTrack], tmp_path_factory: pytest.TempPa
     return out
 
 
+# In the suite: the choice of spheres and how they move the body are tested below.
 @pytest.mark.evidence
 def test_spheres_that_touch_are_moved_where_that_is_wanted(
     capture: Path, plain: Path, known: list[PoseTrack], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -92,6 +93,7 @@ def test_spheres_that_touch_are_moved_where_that_is_wanted(
     assert record["moved_most_m"] < 2.5 * (3**0.5 + 1) * MOVED_STD_M
 
 
+# In the suite: poses come from the checkpoint in test_honest_supervision.py, refusals are those of test_checkpoint.py.
 @pytest.mark.evidence
 def test_an_interrupted_fit_does_not_look_for_poses_again(
     capture: Path, plain: Path, known: list[PoseTrack], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

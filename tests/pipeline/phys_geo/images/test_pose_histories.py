@@ -63,6 +63,7 @@ def test_a_body_that_looks_almost_the_same_turned_about_does_not_flip() -> None:
     assert found.rival_nats > 0
 
 
+# In the suite: the next test: which history is kept, and by how much.
 @pytest.mark.evidence
 def test_a_body_that_looks_the_same_turned_about_keeps_one_history_and_the_other_is_told(
     monkeypatch: pytest.MonkeyPatch,

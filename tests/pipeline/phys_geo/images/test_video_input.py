@@ -159,6 +159,7 @@ def test_empty_masks_count_as_not_seen(partly_hidden: Path) -> None:
     assert "000: right: the masks of 2 of 6 frames show no body that moves freely (frames 3, 5)" in warnings
 
 
+# In the suite: what is left out and the warnings of it are tested above.
 @pytest.mark.evidence
 def test_a_fit_leaves_out_what_is_not_seen_and_says_so(partly_hidden: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     search_briefly(monkeypatch)

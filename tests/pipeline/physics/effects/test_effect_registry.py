@@ -147,6 +147,7 @@ def test_the_built_in_effects_are_the_files_of_the_folder() -> None:
     assert sorted(path.stem for path in folder.glob("*.py") if path.stem not in others) == sorted(BUILT_IN)
 
 
+# In the suite: a measurement of imports; cgwm --help is held to its time in test_cli.py.
 @pytest.mark.evidence
 def test_one_effect_is_imported_without_the_others() -> None:
     code = (

@@ -464,6 +464,7 @@ def test_a_pair_with_the_law_of_all_others_changes_no_bit(fused: Fused) -> None:
     same_bits(fused(alone, start, times(0.2)), fused(listed, start, times(0.2)))
 
 
+# In the suite: values by these laws, and derivatives of contacts under one law, are tested above.
 @pytest.mark.evidence
 def test_derivatives_by_the_laws_of_pairs(fused: Fused) -> None:
     world, _, driven = crowd()
