@@ -117,6 +117,8 @@ def test_only_an_output_of_the_same_kind_is_replaced(things: Path, command: str)
         out = things / name
         if (name in own and command not in FAST) or not out.exists():
             continue
+        if name in own:
+            assert stamps(things) == before, f"{command}: a refusal before {name}"
         try:
             call(things, out)
         except CgwmError as error:
