@@ -65,6 +65,8 @@ class ContactFindings:
     """Detection limits of the contact effects, where contact selected none."""
     sliding: StartedSliding | None = None
     """The sliding segments and their fit without effects of contact; None without any."""
+    as_pyramid: tuple[str, ...] = ()
+    """Effects that slides show no better than a friction pyramid does, so that none is selected."""
 
 
 def with_contact(
@@ -110,9 +112,10 @@ def with_contact(
         segments=resolved.segments,
         sliding=data.sliding,
     )
+    shaped: set[str] = set()
     for test in tests:
         evidence = test.evidence(data, kept)
-        equals = selected(test, evidence, data)
+        equals = [] if shaped & {one.name for one in evidence[:1]} else selected(test, evidence, data)
         added = test.added(data, equals[0]) if equals else None
         if added is not None:
             final, best = added
@@ -120,12 +123,14 @@ def with_contact(
             listed = evidence if test.lists_all else list(every)
             contact = Chosen(best, every, "contact")
             return replace(common, chosen=[*chosen, contact], evidence=listed, world=final)
+        shaped |= {one.name for one in evidence if one.is_pyramid}
         data = replace(data, earlier={**data.earlier, test.name: evidence})
     return replace(
         common,
         evidence=list(data.earlier[tests[-1].name]),
         world=replace(resolved.after_flight, contact=data.world.contact),
         limits=tuple(_limits(data, candidates)),
+        as_pyramid=tuple(sorted(shaped)),
     )
 
 

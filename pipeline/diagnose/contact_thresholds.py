@@ -97,6 +97,14 @@ class SlidingThresholds:
         BY_ARGUMENT,
         "real-like development: the only false name of sliding in 234 captures, in tracks smoothed at 60 Hz",
     )
+    pyramid_share: float = threshold(
+        0.9,
+        "1",
+        "an effect is not named where a friction pyramid, which has no number of its own, reaches this share of its "
+        "fall of chi2",
+        "by argument: as `lead_share`",
+        "two nulls of real-like development in an engine with a pyramid: 1.12 and 1.43 of friction by direction",
+    )
     carriers: int = threshold(
         3,
         "episodes",
@@ -215,6 +223,13 @@ class SegmentsThresholds:
     )
     lead_share: float = threshold(0.5, "1", "another effect within this share of the best score is not separable")
     confirmed: float = threshold(2.0, "standard errors", "distance from zero that a refit must leave")
+    worse_t: float = threshold(
+        1.0,
+        "standard errors",
+        "nor is an effect named from any test that raises the prediction error of held-out contact segments by more, "
+        "in the mean over episodes",
+        BY_ARGUMENT,
+    )
     separate_chi2: float = threshold(
         12.0, "chi2", "contact rules out an equal of flight that is worse by more than this: odds of 400", BY_ARGUMENT
     )

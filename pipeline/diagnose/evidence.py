@@ -15,6 +15,9 @@ from .falsification import Repetition
 from .score_test import ScoreTest
 from .thresholds import THRESHOLDS
 
+NEARLY = 0.999
+"""Share of the limit of a parameter from which it counts as at its limit."""
+
 
 def implausible(effect: Effect, values: Mapping[str, float]) -> list[EffectParameter]:
     """Return the parameters whose values are larger than instruments or nature usually have them."""
@@ -60,6 +63,8 @@ class Evidence:
     """Standard deviation between episodes, by parameter, of an effect with a value for each."""
     without_best: float = math.inf
     """Fall of chi2 without the episode in which it falls most; infinite where it was not computed."""
+    pyramid_share: float = 0.0
+    """Share of its fall of chi2 that a friction pyramid in its place reaches; 0 where it was not compared with one."""
     contact: Mapping[str, float] = field(default_factory=dict)
     """Contact parameters fitted jointly, by their name in the contact law, that a world with the effect takes over."""
 
@@ -83,6 +88,20 @@ class Evidence:
         """Size of the largest parameter, in usual sizes; 0 where only the score test was made."""
         scale = {p.name: p.scale for p in self.candidate.effect.parameters}
         return max((abs(value) / scale[name] for name, (value, _) in self.estimates.items()), default=0.0)
+
+    @property
+    def is_pyramid(self) -> bool:
+        """Whether slides are explained as well by a friction pyramid, which has no number of its own."""
+        return self.pyramid_share > THRESHOLDS.sliding.pyramid_share
+
+    @property
+    def is_number(self) -> bool:
+        """Whether its estimates say how large it is: not all are within their errors of zero, none is at its limit."""
+        numbers = self.estimates
+        within = THRESHOLDS.verdict.zero_errors
+        zero = bool(numbers) and all(abs(value) <= within * error for value, error in numbers.values())
+        pinned = any(abs(numbers[p.name][0]) >= NEARLY * p.limit for p in self.candidate.effect.parameters if numbers)
+        return not (zero or pinned)
 
     @property
     def gain(self) -> float:

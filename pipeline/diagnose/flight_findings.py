@@ -116,8 +116,9 @@ class FlightFindings:
         """Whether the selected effects imitate something else.
 
         Their parameters change from episode to episode, their law is another one, a law of any form explains more of
-        what repeats than they do, or what differs from episode to episode follows a law of the motion and they neither
-        explain nearly all that the model lacks nor repeat with the same parameters.
+        what repeats than they do, they leave all that exceeds the noise, or what differs from episode to episode
+        follows a law of the motion and they neither explain nearly all that the model lacks nor repeat with the same
+        parameters.
         """
         inconsistent = self.agreement is not None and self.agreement.doubtful
         # what is left is known where it is a constant force: a candidate, and no other law that the effects imitate
@@ -127,7 +128,8 @@ class FlightFindings:
         steady = self.predicts and self.agreement is not None and self.agreement.share >= LIMITS.consistent_share
         follows = self.own_law is not None and not (most or steady)
         other = bool(self.fleeting) or any(one.better for one in self.others)
-        return inconsistent or imitated or follows or other
+        useless = bool(self.in_flight) and is_significant(self.after) and self.explained_share <= 0
+        return inconsistent or imitated or follows or other or useless
 
 
 def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candidate]) -> FlightFindings:
@@ -268,7 +270,7 @@ class _Search:
         found = completed(beside.prepared, chosen, self.candidates, scatter, errors)
         prepared, quick = beside.prepared.with_own(found.world), self.prepared.with_own(found.world)
         tested = judged(prepared, found, scatter, slow, own_law is not None)
-        found = tested.selection.with_scatter(prepared.groups, scatter)
+        found = tested.selection.with_scatter(prepared.groups, scatter).without_idle()
         changed = found.world is not self.world
         left, share = _left(quick, self.world, found.world, changed)
         return FlightFindings(
@@ -280,7 +282,7 @@ class _Search:
             segments=found.flight,
             before=before,
             after=worst_omnibus(flight_windows(prepared, found.world), scatter) if changed else before,
-            agreement=tested.agreement,
+            agreement=tested.agreement if found.names else None,
             fleeting=tuple(sorted(tested.fleeting & set(found.names))),
             others=tuple(one for one in tested.others if one.effect in found.names),
             left=left,

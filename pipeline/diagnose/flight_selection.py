@@ -58,6 +58,22 @@ class FlightSelection(NamedTuple):
         world, flight = _without(self.flight, self.world, names)
         return FlightSelection([step for step in self.steps if step.best.name not in names], world, flight)
 
+    def without_idle(self) -> FlightSelection:
+        """Leave out the effects that have no number, or without which held-out flights are predicted as well.
+
+        Where none is left, the step that selected the first one stays, as one that selected none.
+        """
+        found = self
+        for step in reversed(self.steps):
+            name = step.best.name
+            if (
+                name in found.names
+                and not _carrying(found, name)
+                and (not step.best.is_number or _adds_nothing(found, name))
+            ):
+                found = found.without({name})
+        return found if found.steps else found._replace(steps=[replace(self.steps[0], flagged=False)])
+
     def bic(self, scatter: float) -> float:
         """Return BIC, up to a constant of the flights; infinite without flight.
 
@@ -193,10 +209,24 @@ def _with_the_needed(found: FlightSelection) -> FlightSelection:
 
 
 def _alone_or_carrying(found: FlightSelection, name: str) -> bool:
-    """Return whether no effect is left without one, or only such as act through it: wind acts through a drag."""
+    """Return whether no effect is left without one, or only such as act through it."""
     others = set(found.names) - {name}
     own = any(step.own_std is not None for step in found.steps)
-    return not (others or own) or ("wind" in others and not others & set(DRAGS))
+    return not (others or own) or _carrying(found, name)
+
+
+def _carrying(found: FlightSelection, name: str) -> bool:
+    """Return whether another effect acts through one: wind acts through a drag."""
+    others = set(found.names) - {name}
+    return name in DRAGS and "wind" in others and not others & set(DRAGS)
+
+
+def _adds_nothing(found: FlightSelection, name: str) -> bool:
+    """Return whether held-out flights are predicted as well without an effect, its parameters from the others."""
+    other = found.without({name})
+    if found.flight is None or other.flight is None:
+        return False
+    return held_out_loss(other.flight, other.world) <= held_out_loss(found.flight, found.world)
 
 
 def _unless_needed(found: FlightSelection, name: str) -> FlightSelection:

@@ -23,8 +23,10 @@ from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
 
-CONSTANT = ("gravity_tilt", "frame_tilt", "constant_force", "gravity_scale", "buoyancy")
-"""Effects whose acceleration in flight is constant."""
+CONSTANT = ("gravity_tilt", "frame_tilt", "constant_force", "gravity_scale", "buoyancy", "length_scale", "clock_scale")
+"""Effects whose acceleration in flight is constant: scales of lengths and clock change what gravity seems to be."""
+SCALES = ("length_scale", "clock_scale")
+"""Those of them that act on what is measured."""
 USUAL_FLIGHT = 0.75
 """Quantile of the flights' lengths over which the force fades or grows: shorter flights show less of it."""
 
@@ -79,7 +81,6 @@ def _fading_and_growing(flight: Segments, name: str) -> Tensor:
     """
     seen = flight.observations
     times = seen.times_s
-    moved = flight.positions() - flight.in_world(without_effect(flight.world, name)).positions()
     lengths = [float(row[n - 1] - row[0]) for row, n in zip(times, flight.lengths, strict=True)]
     begun: dict[int, float] = {}
     for item, first in zip(flight.items, times[:, 0].tolist(), strict=True):
@@ -87,9 +88,7 @@ def _fading_and_growing(flight: Segments, name: str) -> Tensor:
     starts = [begun[item.episode] for item in flight.items]
     since = times - torch.tensor(starts).to(times)[:, None]
     share = (since / float(np.quantile(lengths, USUAL_FLIGHT))).clamp(0.0, 1.0)[..., None, None]
-    # a constant acceleration, by the longest flight
-    longest = int(np.argmax(lengths))
-    acceleration = 2 * moved[longest, flight.lengths[longest] - 1] / lengths[longest] ** 2
+    acceleration = _acceleration(flight, name, lengths)
     step = times.diff(dim=1)[..., None, None]
     paths = []
     for weight in (1 - share, share):
@@ -100,3 +99,17 @@ def _fading_and_growing(flight: Segments, name: str) -> Tensor:
         paths.append(path * (seen.seen[..., None] * seen.measured_axes[:, None]) / flight.noise.position_m)
     positions = torch.stack(paths, -1)
     return torch.cat((positions, torch.zeros_like(positions)), 3).flatten(1, 2)
+
+
+def _acceleration(flight: Segments, name: str, lengths: Sequence[float]) -> Tensor:
+    """Return the acceleration [m/s2] that a named constant effect adds, shape (nb, 3) or (1, 3), from the lengths [s].
+
+    A scale changes where a flight begins, too, and what it adds to its acceleration is that of gravity alone (derived).
+    """
+    values = next(active.values for active in flight.world.effects if active.effect.name == name)
+    if name in SCALES:
+        factor = 1 + values["s"][:1, None]
+        return flight.world.gravity[:1] * ((factor if name == "length_scale" else factor.pow(-2)) - 1)
+    moved = flight.positions() - flight.in_world(without_effect(flight.world, name)).positions()
+    longest = int(np.argmax(lengths))
+    return 2 * moved[longest, flight.lengths[longest] - 1] / lengths[longest] ** 2

@@ -161,6 +161,13 @@ class VerdictThresholds:
         "beside correlated errors, one of several effects is left out if the loss of held-out flights rises by less",
         "by argument, as in `improve`; looked at on one recording of throws, it takes away the second of two drags",
     )
+    zero_errors: float = threshold(
+        1.0,
+        "standard errors",
+        "an effect all of whose parameters lie within so many of zero is not named, nor is one with a parameter at the "
+        "limit of its range",
+        BY_ARGUMENT,
+    )
     same_error: float = threshold(
         1.25,
         "1",

@@ -24,7 +24,7 @@ from .flight_omnibus import is_significant
 from .remaining import bad_ones, misfits_of
 from .thresholds import THRESHOLDS
 
-LIMITS = THRESHOLDS.verdict
+LIMITS, CONTACT = THRESHOLDS.verdict, THRESHOLDS.segments
 
 VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable", "law_inexact"]
 
@@ -59,6 +59,8 @@ class Findings:
     """Detection limits of the contact effects, where contact selected none."""
     sliding: StartedSliding | None = None
     """The sliding segments and their fit without effects of contact; None without any."""
+    as_pyramid: tuple[str, ...] = ()
+    """Effects that slides show no better than a friction pyramid does, so that none is selected."""
 
     misfits: tuple[PhaseMisfit, ...] = ()
     """How the law of contact describes each phase, the worst first; none where contact selected an effect."""
@@ -88,8 +90,8 @@ def find(
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
     note("diagnose: held-out episodes")
     errors = _errors(contact, flown)
-    if flown.remains or flown.own:  # what flights show may be what contact imitates
-        contact = _without_useless(contact)
+    # what flights show may be what contact imitates
+    contact = _without_useless(contact, CONTACT.confirmed if flown.remains or flown.own else -CONTACT.worse_t)
     in_contact = any(one.where == "contact" for one in contact.chosen)
     misfits = () if contact.segments is None or in_contact else misfits_of(contact.segments)
     verdict = _verdict(contact.chosen, flown)
@@ -109,6 +111,7 @@ def find(
         as_good=tuple(one for one in flown.others if one.as_good),
         limits=contact.limits,
         sliding=contact.sliding,
+        as_pyramid=contact.as_pyramid,
         misfits=tuple(misfits),
     )
 
@@ -130,14 +133,19 @@ def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
     return "missing_effect" if chosen else "none_missing"
 
 
-def _without_useless(contact: ContactFindings) -> ContactFindings:
-    """Return the findings without the effects of contact that lower the error of held-out episodes by chance."""
+def _without_useless(contact: ContactFindings, least: float) -> ContactFindings:
+    """Return the findings without the effects of contact that lower the error of held-out episodes too little.
+
+    Args:
+        contact: The findings.
+        least: Least mean fall of an episode's error, in its standard errors.
+    """
     if contact.segments is None:
         return contact
     present = {active.effect.name for active in contact.world.effects}
     named = {one.evidence.name for one in contact.chosen if one.where == "contact"} & present
     falls = {name: held_out_fall(contact.segments, contact.world, name) for name in named}
-    useless = {name for name, fall in falls.items() if fall < THRESHOLDS.segments.confirmed}
+    useless = {name for name, fall in falls.items() if fall < least}
     world = contact.world
     for name in sorted(useless):
         world = without_effect(world, name)

@@ -216,5 +216,11 @@ def misfit_warnings(findings: Findings) -> list[str]:
 
 
 def law_warnings(findings: Findings) -> list[str]:
-    """Return a warning for each selected effect whose flights fit another law equally well."""
-    return [f"{law.effect}: these flights fit {law.formula} as well as its own law." for law in findings.as_good]
+    """Return a warning for each effect whose motions fit another law equally well."""
+    found = [f"{law.effect}: these flights fit {law.formula} as well as its own law." for law in findings.as_good]
+    return found + [
+        f"{name}: not named, since the slides fit a friction limited along each of two axes by itself as well, as "
+        "engines with a friction pyramid have it and no surface does. Next, where they were measured on a surface, "
+        "record slides along x, along y and between them."
+        for name in findings.as_pyramid
+    ]

@@ -139,6 +139,8 @@ class ContactTest(Protocol):
 def selected(test: ContactTest, evidence: Sequence[Evidence], data: ContactData) -> list[Evidence]:
     """Return the effect that a test selects and its equals, the selected one first; empty where it selects none.
 
+    Where the best effect is one without a number, no other one is selected in its place: it explains less.
+
     Args:
         test: The test.
         evidence: Its evidence, the best first.
@@ -148,6 +150,8 @@ def selected(test: ContactTest, evidence: Sequence[Evidence], data: ContactData)
     if not admissible:
         return []
     best = admissible[0]
+    if not best.is_number:
+        return []
     leads = test.leads(best)
     equals = [best, *(one for one in admissible[1:] if any(lead.shared(best, one) for lead in leads))]
     return equals if any(bar.passed(best) for bar in test.bars(equals, data)) else []

@@ -92,12 +92,13 @@ class SegmentsTest(ContactTest):
         return (Bar(score=self.limits.agreed_score, gain_t=self.limits.gain_t),)
 
     def added(self, data: ContactData, best: Evidence) -> tuple[World, Evidence] | None:
-        """Return the world refitted with the effect, and the evidence with its estimates; None if it may be zero."""
+        """Return the world refitted with the effect, and the evidence with its estimates; None without a number."""
         assert data.segments is not None  # without contact segments there is no evidence
         world, estimates = _refitted(data.world, data.segments, best)
         if not any(abs(value) > self.limits.confirmed * error for value, error in estimates.values()):
             return None
-        return world, replace(best, numbers=estimates)
+        found = replace(best, numbers=estimates)
+        return (world, found) if found.is_number else None
 
 
 def _acts_near_ground(variant: Variant) -> bool:

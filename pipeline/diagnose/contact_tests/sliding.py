@@ -15,12 +15,14 @@ from typing import ClassVar
 import numpy as np
 import torch
 
+from ...physics.effects.effect import ActiveEffect
 from ...segments.candidates import Candidate, Variant, with_variants
 from ...segments.segments import Segments
 from ...segments.separate_starts import separate_starts
 from ...segments.sliding_descent import ITERATIONS, SlidingFit, information_by_segment
 from ...segments.sliding_fit import StartedSliding, better_starts, fit_sliding, nuisance_parameters
 from ...segments.thresholds import SEGMENT_THRESHOLDS
+from ..alternative_laws import FrictionPyramid
 from ..evidence import Evidence
 from ..thresholds import THRESHOLDS, SlidingThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
@@ -74,8 +76,10 @@ class SlidingTest(ContactTest):
         variant, fit = next(
             one for one in found if candidates[one[0].place] is best.candidate and one[0].constants == best.constants
         )
-        gains = held_out_gains(variant, fit, started)
-        return [replace(one, gains=gains) if one is best else one for one in evidence]
+        told = replace(best, gains=held_out_gains(variant, fit, started))
+        if any(bar.passed(told) for bar in self.bars([told], data)):
+            told = replace(told, pyramid_share=pyramid_share(started, variant, fit, least))
+        return [told if one is best else one for one in evidence]
 
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
         """Return the leads in score, the second over effects that explain nearly as much.
@@ -96,6 +100,8 @@ class SlidingTest(ContactTest):
         if best.name in self.limits.higher_at_rest and (best.test.estimate < 0).any():
             return ()
         if data.sliding is not None and not _unexplained(data.sliding, self.limits.surplus_sigmas):
+            return ()
+        if best.is_pyramid:
             return ()
         parameters = len(best.candidate.effect.parameters)
         flexible = parameters > self.limits.few_parameters
@@ -155,6 +161,22 @@ def held_out_gains(variant: Variant, fit: SlidingFit, started: StartedSliding) -
         count, before, after = (float(one[mine].sum()) for one in (degrees, started.base.chi2, fit.chi2))
         gains.append(2 * count * math.log((before + count) / (max(after + float(predicted), 0.0) + count)))
     return tuple(gains)
+
+
+def pyramid_share(started: StartedSliding, variant: Variant, fit: SlidingFit, base: float) -> float:
+    """Return the share of an effect's fall of chi2 that a friction pyramid in its place reaches.
+
+    Args:
+        started: The sliding segments and their fit without effects.
+        variant: The effect.
+        fit: Its fit, from whose states the fit of the pyramid starts.
+        base: Smallest chi2 without either.
+    """
+    soft = started.segments.world
+    world = replace(soft, effects=(*soft.effects, ActiveEffect.of(FrictionPyramid(), {}, soft.gravity[0, :1])))
+    own = fit.values[0, : fit.values.shape[1] - len(variant.parameters)]
+    found = fit_sliding(world, [], [(fit.segments.in_world(world), own)], started.flight_parameters)[0]
+    return (base - found.cost) / max(base - fit.cost, 1e-9)
 
 
 def _fits(
