@@ -96,7 +96,7 @@ def import_csv(
         left_out: Counter[str] = Counter()
         tracks = (_tracks(path, columns or {}, units, body, left_out, spin_frame) for path in files)
         result = write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
-    return result.model_copy(update={"warnings": _left_out_warnings(left_out, len(files))})
+    return result.model_copy(update={"warnings": (*result.warnings, *_left_out_warnings(left_out, len(files)))})
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ def import_pushes(
             " The object has a pose before and one after each push alone, which 'cgwm fit' does not take: "
             "benchmarks/pushes.py fits friction and face_exponent to them."
         )
-    return result.model_copy(update={"warnings": (said,)})
+    return result.model_copy(update={"warnings": (*result.warnings, said)})
 
 
 def read_pushes(path: Path) -> list[Push]:

@@ -86,7 +86,8 @@ class Units:
     ) -> Track:
         """Return a track in metres and seconds, without a shift of its times.
 
-        Samples without a finite position are omitted, as gaps are allowed.
+        Samples without a finite position are omitted, as gaps are allowed; those at the ends are said here, gaps in the
+        result of the import.
 
         Args:
             where: What the numbers come from, for messages.
@@ -107,8 +108,9 @@ class Units:
         seen = np.asarray(np.isfinite(position).all(1))
         if quat_wxyz is not None:
             seen &= np.isfinite(quat_wxyz).all(1)
-        if (gaps := int(np.count_nonzero(~seen))) > 0:
-            note(f"{where}: {gaps} of {len(seen)} samples have no pose and are left out")
+        known = np.flatnonzero(seen)
+        if len(known) and (outside := len(seen) - (known[-1] - known[0] + 1)):  # gaps inside: `gap_warnings`
+            note(f"{where}: {outside} samples before the first pose or after the last one are left out")
         time, position = time[seen], position[seen]
         if len(time) < 2:
             raise InputDataError(

@@ -162,6 +162,20 @@ def test_csv_gaps_bodies_and_splits(tmp_path: Path) -> None:
     assert (len(other["train"]), len(other["test"])) == (3, 2) and other["train"] != splits["train"][:3]
 
 
+def test_samples_without_a_pose_are_said_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Gaps stand in the result of the import; what is cut off at the ends, where no gap is left, is noted."""
+    said: list[str] = []
+    monkeypatch.setattr("cgwm.datasets.importers.recordings.note", said.append)
+    lost = {1, 7, 8, 18, 19}
+    rows = [f"{0.01 * k},{'nan' if k in lost else k},2,3" for k in range(20)]
+    for name, some in (("whole", rows[2:18]), ("ends", rows[:7] + rows[9:])):
+        (tmp_path / f"{name}.csv").write_text("\n".join(["t,x,y,z", *some]) + "\n", encoding="utf-8")
+    result = import_csv(tmp_path / "whole.csv", tmp_path / "a")
+    assert said == [] and len(result.warnings) == 1 and "lacks 2 of 16 samples" in result.warnings[0]
+    import_csv(tmp_path / "ends.csv", tmp_path / "b")
+    assert len(said) == 1 and "2 samples before the first pose or after the last one" in said[0]
+
+
 @pytest.mark.parametrize("number", ["1_000", "0x10", "1e400", "inf", "١٢", "1.5\0", "9" * 400])
 def test_what_is_no_plain_number_is_refused_with_its_line(number: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(f"t,x,y,z\n0,1,2,3\n0.1,{number},2,3\n", encoding="utf-8")
