@@ -10,6 +10,7 @@ from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode
 from ...datasets.models.model import POSE_TRACKS, Model
 from ...schemas import InputDataError
+from ..trajectories.frame_times import with_regular_times
 from ..trajectories.observations import track_episodes
 from .thresholds import THRESHOLDS
 
@@ -44,7 +45,7 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
     warnings: tuple[str, ...] = ()
     names = capture.episodes(split)
     if any(free & set(capture.tracks(name)) for name in names) or not any(capture.videos(name) for name in names):
-        found = track_episodes(capture, split)
+        found, warnings = with_regular_times(track_episodes(capture, split), free)
     else:
         found, known = _filmed(model, capture, split), _filmed_noise(model, names)
         warnings = (

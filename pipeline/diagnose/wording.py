@@ -49,7 +49,8 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         return f"No effect is named, but {_INEXACT}: {_misfit(findings)}{_described(findings)}"
     if findings.verdict == "unexplained":
         where = f" {organised(law.where)}" if law is not None else ""
-        return f"Something is missing in flight, and none of the candidates explains it.{where}{_own(findings)}"
+        what = f"Something is missing in flight, and none of the candidates explains it.{where}{_own(findings)}"
+        return f"{what}{_timed(findings)}"
     words = []
     for one in findings.chosen:
         others = [e.candidate.spec for e in one.equals[1:]]
@@ -90,6 +91,14 @@ def _own(findings: Findings) -> str:
             "of a spin: measure the spin."
         )
     return f" Each episode is pushed in another direction, which follows its {law}."
+
+
+def _timed(findings: Findings) -> str:
+    """Return what errors of the frames' times may do; empty where there are none."""
+    wrong_s = findings.flight.prepared.time_error_s
+    if not wrong_s:
+        return ""
+    return f" Times of frames that are wrong by {1e3 * wrong_s:.2g} ms may be all of it: mend them first."
 
 
 def _apart(findings: Findings) -> str:

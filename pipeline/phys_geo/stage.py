@@ -36,6 +36,7 @@ from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
 from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.described_motion import not_described
+from ..trajectories.frame_times import with_regular_times
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from .material_pairs import require_known_pairs, start_laws, with_pusher_law
@@ -163,7 +164,8 @@ def _fitted_motion(
     if config.supervise == "tracks":
         measured = capture.manifest.measurement
         noise = (measured.position_std_m, measured.rotation_std_rad)
-        episodes = track_episodes(capture, split)
+        free = {body.name for body in ready.file.bodies if body.motion == "free"}
+        episodes, clocked = with_regular_times(track_episodes(capture, split), free)
         spans = durations(episodes)
         with within_budget(fit_parts(world, spans, config), LESS, doubt=motion_doubt(spans)):
             kept = [p for p in ready.file.parameters if not p.name.endswith(FACTORS)]
@@ -174,7 +176,7 @@ def _fitted_motion(
             )
         unturned = {name: capture.checked_tracks(name).unturned for name in capture.episodes(split)}
         warnings = [text for text in (capture.unturned_warning(unturned),) if text]
-        return replace(found, warnings=(*found.warnings, *warnings))
+        return replace(found, warnings=(*clocked, *found.warnings, *warnings))
     refuse_joints(ready.file.articulations, ready.place, f"fit with --supervise {config.supervise}")
     for name in ("mass_distribution", "length_scale"):
         if getattr(config, name) is True:

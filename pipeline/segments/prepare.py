@@ -16,6 +16,7 @@ from ...datasets.capture.tracks import Episode
 from ..physics.world import World
 from ..trajectories.correlated_noise import estimate_noise_model, noise_model_warnings
 from ..trajectories.flight_noise import flight_noise, slow_noise, without_outliers
+from ..trajectories.frame_times import time_errors
 from ..trajectories.innovations import WHITE, NoiseModel
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, supported_frames, whole_episodes
@@ -68,6 +69,8 @@ class Prepared:
     """Correlation of the errors in time."""
     left_out_s: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     """Times [s] of the frames of flight that are left out as wrong measurements, by name of the episode."""
+    time_error_s: float = 0.0
+    """Standard deviation of errors of the frames' times [s]; 0 where flights show none."""
 
     @property
     def least_force_m_s2(self) -> float:
@@ -151,6 +154,7 @@ def prepare(
         _mark_supported_frames(state)
         _remove_outliers(state)
         _remove_held_starts(state)
+        _measure_times(state)
         _model_correlated_noise(state)
     left_out = _left_out(state, world, episodes)
     turned = state.oriented
@@ -177,6 +181,7 @@ def prepare(
         released_s=released,
         noise_model=state.noise_model,
         left_out_s=left_out,
+        time_error_s=state.time_error_s,
     )
 
 
@@ -210,6 +215,8 @@ class _State:
     """First free frame of the episodes, by index, that begin in a hand."""
     noise_model: NoiseModel = WHITE
     """Correlation of the errors in time."""
+    time_error_s: float = 0.0
+    """Standard deviation of errors of the frames' times [s]; 0 where flights show none."""
     fitted: Segments | None = None
     """The flights with fitted states; None where there are none."""
     warnings: list[str] = field(default_factory=list)
@@ -341,6 +348,17 @@ def _times_words(name: str, times_s: Sequence[float]) -> str:
     """Return an episode's times in words, without all of many."""
     shown = ", ".join(f"{time:.3f}" for time in times_s[:NAMED])
     return f"{name} at {shown} s" + (f" and {len(times_s) - NAMED} more" if len(times_s) > NAMED else "")
+
+
+def _measure_times(state: _State) -> None:
+    """Measure the errors of the frames' times, and say what they do where there are any."""
+    state.time_error_s, std_m = time_errors(state.observations, state.flight)
+    if state.time_error_s:
+        state.warnings.append(
+            f"the times of the frames are wrong by {1e3 * state.time_error_s:.2g} ms: errors along the motion grow "
+            f"with the speed, where those across it are {1e3 * std_m:.2g} mm. They hide small forces and may look like "
+            "one. Record the times of the exposures, or trigger the shutter by a clock."
+        )
 
 
 def _model_correlated_noise(state: _State) -> None:

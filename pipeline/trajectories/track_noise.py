@@ -68,15 +68,15 @@ def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> Noise:
             continue
         rows = first[:, None] + np.arange(window)
         t = track.time_s[rows] - track.time_s[rows].mean(1, keepdims=True)
-        positions.append(_residuals(t, track.position_m[:, moves(track.position_m)][rows], degree).ravel())
+        positions.append(polynomial_residuals(t, track.position_m[:, moves(track.position_m)][rows], degree).ravel())
         if track.quat_wxyz is not None:
             middle, turn = (
                 Rotation.from_quat(track.quat_wxyz[frames], scalar_first=True)
                 for frames in (np.repeat(rows[:, WINDOW // 2], window), rows.ravel())
             )
             turned = (middle.inv() * turn).as_rotvec().reshape(*rows.shape, 3)
-            rotations.append(_residuals(t, turned, degree).ravel())
-    return Noise(max(_spread(positions), FLOOR_M), max(_spread(rotations), FLOOR_RAD))
+            rotations.append(polynomial_residuals(t, turned, degree).ravel())
+    return Noise(max(spread(positions), FLOOR_M), max(spread(rotations), FLOOR_RAD))
 
 
 def moves(position_m: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ def moves(position_m: np.ndarray) -> np.ndarray:
     return changes if changes.any() else np.ones(3, bool)
 
 
-def _residuals(t: np.ndarray, values: np.ndarray, degree: int) -> np.ndarray:
+def polynomial_residuals(t: np.ndarray, values: np.ndarray, degree: int) -> np.ndarray:
     """Return the residuals (W, n, k) of polynomials of windows, scaled for the degrees of freedom that they use.
 
     Args:
@@ -99,6 +99,6 @@ def _residuals(t: np.ndarray, values: np.ndarray, degree: int) -> np.ndarray:
     return residuals * np.sqrt(count / (count - degree - 1))
 
 
-def _spread(residuals: list[np.ndarray]) -> float:
+def spread(residuals: list[np.ndarray]) -> float:
     """Return the robust standard deviation of residuals; 0 without any."""
     return float(MAD_TO_STD * np.median(np.abs(np.concatenate(residuals)))) if residuals else 0.0

@@ -1,0 +1,84 @@
+"""Times that scatter about a regular clock are put on it where the motion follows it; wrong times are measured."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cgwm.datasets.capture.tracks import Episode, Track
+from cgwm.pipeline.segments.prepare import prepare
+from cgwm.pipeline.trajectories.frame_times import with_regular_times
+from cgwm.pipeline.trajectories.track_noise import Noise
+from helpers.diagnosis_data import world_with
+
+Said = Callable[[list[Episode]], list[Episode]]
+STEP_S, NOISE_M, JITTER_S = 1 / 240, 2e-4, 5e-4
+
+
+def throws(seed: int, exposed: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> list[Episode]:
+    """Return throws of a point in which some frames are lost; `exposed`: exposures, by the times of a clock."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for k in range(6):
+        clock = STEP_S * np.flatnonzero(rng.uniform(size=100) > 0.1)
+        t = exposed(clock, rng)
+        v = rng.uniform((-2, -2, 3), (2, 2, 5))
+        path = np.array([0, 0, 3.0]) + t[:, None] * v + 0.5 * t[:, None] ** 2 * np.array([0, 0, -9.81])
+        found.append(Episode(f"{k}", {"ball": Track(clock, path + rng.normal(0, NOISE_M, path.shape))}))
+    return found
+
+
+def scattered(episodes: list[Episode]) -> list[Episode]:
+    rng = np.random.default_rng(9)
+
+    def moved(track: Track) -> Track:
+        return Track(track.time_s + rng.normal(0, JITTER_S, len(track.time_s)), track.position_m)
+
+    return [Episode(name, {body: moved(track) for body, track in tracks.items()}) for name, tracks in episodes]
+
+
+def rounded(episodes: list[Episode]) -> list[Episode]:
+    """Return times in whole milliseconds."""
+    return [Episode(n, {"ball": replace(t["ball"], time_s=np.round(t["ball"].time_s, 3))}) for n, t in episodes]
+
+
+def regular(clock: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return clock
+
+
+def late(clock: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return clock + rng.normal(0, JITTER_S, len(clock))
+
+
+@pytest.mark.parametrize("said", [scattered, rounded])
+def test_times_that_scatter_are_put_on_the_clock_that_the_motion_follows(said: Said) -> None:
+    made = throws(1, regular)
+    found, warnings = with_regular_times(said(made), {"ball"})
+    assert len(warnings) == 1 and "240 Hz" in warnings[0]
+    for (_, tracks), (_, true) in zip(found, made, strict=True):
+        away = tracks["ball"].time_s - true["ball"].time_s
+        assert np.abs(away).max() < 0.5 * JITTER_S and np.ptp(np.diff(away)) < 1e-5
+
+
+@pytest.mark.parametrize("bodies", [{"ball"}, {"other"}])
+def test_right_times_stay(bodies: set[str]) -> None:
+    """Exposures that scatter, with their own times, are not put on a clock."""
+    rng = np.random.default_rng(3)
+    right = []
+    for name, tracks in throws(3, regular):
+        clock = tracks["ball"].time_s
+        t = clock + rng.normal(0, JITTER_S, len(clock))
+        path = t[:, None] * np.array([1.5, 0.5, 4.0]) + 0.5 * t[:, None] ** 2 * np.array([0, 0, -9.81])
+        right.append(Episode(name, {"ball": Track(t, path + rng.normal(0, NOISE_M, path.shape))}))
+    for episodes in (right, throws(4, regular)):
+        found, warnings = with_regular_times(episodes, bodies)
+        assert warnings == () and all(a is b for (_, a), (_, b) in zip(found, episodes, strict=True))
+
+
+def test_wrong_times_of_exposures_are_measured_and_said() -> None:
+    world = world_with("ball")
+    prepared = prepare(world, throws(5, late), (None, None))
+    assert prepared.time_error_s == pytest.approx(JITTER_S, rel=0.15)
+    assert any("0.5 ms" in text and "trigger the shutter" in text for text in prepared.warnings)
+    plain = prepare(world, throws(6, regular), Noise(NOISE_M, 0.01))
+    assert plain.time_error_s == 0.0
