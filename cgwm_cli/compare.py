@@ -52,7 +52,11 @@ def compare(
     from ..schemas import UsageError
 
     if not warmup_s > 0:
-        raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
+        raise UsageError(
+            f"--warmup-s {warmup_s:g}: not a positive duration.",
+            "more than 0 s.",
+            "pass a duration in seconds, such as --warmup-s 0.1.",
+        )
     from ..pipeline.compare.page import default_page
 
     page = out or default_page(models, split)

@@ -37,7 +37,11 @@ def evaluate(
     from ..schemas import UsageError
 
     if not warmup_s > 0:
-        raise UsageError(f"--warmup-s {warmup_s:g}: not a positive duration.", "more than 0 s.")
+        raise UsageError(
+            f"--warmup-s {warmup_s:g}: not a positive duration.",
+            "more than 0 s.",
+            "pass a duration in seconds, such as --warmup-s 0.1.",
+        )
     emit(work(model, target, split, warmup_s, device, accept_units), _summary)
 
 

@@ -60,5 +60,9 @@ def _borders(text: str) -> tuple[float, float, float, float]:
     except ValueError:
         left = upper = right = lower = math.nan
     if not all(map(math.isfinite, (left, upper, right, lower))):
-        raise UsageError(f"--box {text}: not four numbers.", "x0,y0,x1,y1 in pixels, for example 120,80,520,430.")
+        raise UsageError(
+            f"--box {text}: not four numbers.",
+            "x0,y0,x1,y1 in pixels, for example 120,80,520,430.",
+            "read the four numbers off the picture, in pixels.",
+        )
     return left, upper, right, lower

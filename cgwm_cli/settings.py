@@ -70,10 +70,18 @@ class StageSettings:
         stage, *path = (part.strip() for part in key.split("."))
         if not (equals and stage and path and all(path)):
             example = f"{self._stages[0]}.seed=1"
-            raise UsageError(f"--set {text}: not a setting.", f"STAGE.KEY=VALUE, for example {example}.")
+            raise UsageError(
+                f"--set {text}: not a setting.",
+                f"STAGE.KEY=VALUE, for example {example}.",
+                "write it as in the example.",
+            )
         if stage not in self._stages:
             legal = f"{', '.join(self._stages)}.{did_you_mean(stage, self._stages)}"
-            raise UsageError(f"--set {text}: this command runs no stage '{stage}'.", legal)
+            raise UsageError(
+                f"--set {text}: this command runs no stage '{stage}'.",
+                legal,
+                "begin the key with the name of one of these stages.",
+            )
         table = self._values
         for part in [stage, *path[:-1]]:
             table = table.setdefault(part, {})

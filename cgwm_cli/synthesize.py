@@ -82,7 +82,9 @@ def synthesize(
     )
     if plan is not None:
         if "plan" in settings.model_fields_set:
-            raise UsageError("--plan and synthesize.plan in the settings were given.", "one of the two.")
+            raise UsageError(
+                "--plan and synthesize.plan in the settings were given.", "one of the two.", "leave one of the two out."
+            )
         settings = settings.model_copy(update={"plan": read_plan(plan)})
     if print_plan:
         from ..pipeline.synthesize.job import resolved_plan
@@ -110,10 +112,16 @@ def _refuse_contradictions(shard: str | None, shards: int | None, ray: str | Non
 
     if shard is not None and (shards is not None or ray is not None):
         other = "--shards" if shards is not None else "--ray"
-        raise UsageError(f"--shard {shard} is one shard, {other} makes all.", "one of the two.")
+        raise UsageError(
+            f"--shard {shard} is one shard, {other} makes all.", "one of the two.", "leave one of the two out."
+        )
     if workers > 1 and (shard is not None or ray is not None):
         other = "--shard makes one" if shard is not None else "--ray has its own workers"
-        raise UsageError(f"--workers {workers} makes several shards at a time here; {other}.", "one of the two.")
+        raise UsageError(
+            f"--workers {workers} makes several shards at a time here; {other}.",
+            "one of the two.",
+            "leave one of the two out.",
+        )
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -121,7 +129,7 @@ def _shard(text: str) -> tuple[int, int]:
 
     index, slash, count = text.partition("/")
     if not (slash and index.isdecimal() and count.isdecimal()) or int(index) >= int(count):
-        raise UsageError(f"--shard {text}: not a shard.", "I/N with 0 <= I < N, for example 3/64.")
+        raise UsageError(f"--shard {text}: not a shard.", "I/N with 0 <= I < N, for example 3/64.", "pass --shard I/N.")
     return int(index), int(count)
 
 

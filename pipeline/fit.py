@@ -236,6 +236,7 @@ def _fitted_model(request: _Request, checkpoint: Checkpoint, moves: bool, warnin
         raise InputDataError(
             f"{request.capture.root}: --effects, but split '{request.split}' has no motion to fit them to.",
             "tracks or videos of its episodes.",
+            "add tracks/<episode>.csv, name another split with --split, or leave --effects out.",
         )
     return model
 
@@ -292,6 +293,7 @@ def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatCon
             raise InputDataError(
                 f"{parent}: its bodies are {names}, those of {capture.root} are {capture.body_names}.",
                 "a model of this capture's bodies.",
+                f"leave --from out, or run 'cgwm fit {capture.root} --out MODEL' first.",
             )
         if stage == "phys-geo":
             return model

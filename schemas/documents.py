@@ -69,7 +69,11 @@ def parse_toml(text: str, path: Path | str) -> dict[str, Any]:
     """Return the tables that a TOML text holds; arguments and errors as in :func:`parse_json`."""
     text = text.removeprefix("\ufeff")
     if len(text) > MAX_TOML_BYTES:
-        raise InputDataError(f"{path}: {len(text) / 1e6:.0f} MB.", f"TOML of at most {MAX_TOML_BYTES / 1e6:.0f} MB.")
+        raise InputDataError(
+            f"{path}: {len(text) / 1e6:.0f} MB.",
+            f"TOML of at most {MAX_TOML_BYTES / 1e6:.0f} MB.",
+            "check that this is the right file.",
+        )
     if _DEEP_KEY.search(text):
         raise _too_deep(path)
     try:

@@ -69,7 +69,11 @@ def read_text_file(path: Path | str, encoding: str = "utf-8") -> str:
     path = require_regular_file(path)
     size = path.stat().st_size
     if size > MAX_BYTES:
-        raise InputDataError(f"{path}: {size / 2**30:.1f} GiB.", f"a text of at most {MAX_BYTES / 2**30:g} GiB.")
+        raise InputDataError(
+            f"{path}: {size / 2**30:.1f} GiB.",
+            f"a text of at most {MAX_BYTES / 2**30:g} GiB.",
+            "check that this is the right file.",
+        )
     try:
         return path.read_text(encoding=encoding)
     except UnicodeDecodeError:
@@ -89,7 +93,11 @@ def read_binary_file(path: Path | str, most_bytes: int = MAX_BYTES) -> bytes:
     path = require_regular_file(path)
     size = path.stat().st_size
     if size > most_bytes:
-        raise InputDataError(f"{path}: {size / 2**30:.1f} GiB.", f"a file of at most {most_bytes / 2**30:g} GiB.")
+        raise InputDataError(
+            f"{path}: {size / 2**30:.1f} GiB.",
+            f"a file of at most {most_bytes / 2**30:g} GiB.",
+            "check that this is the right file.",
+        )
     try:
         return path.read_bytes()
     except OSError as error:

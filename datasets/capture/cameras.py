@@ -265,6 +265,7 @@ def _pose_at(name: str, poses: Array, frame: int | None) -> Array:
         raise InputDataError(
             f"the video camera '{name}' has {len(poses)} poses, one a frame; frame {frame} was asked for.",
             f"0 to {len(poses) - 1}.",
+            "remove the frames without a pose, or add these.",
         )
     return poses[frame]
 

@@ -182,6 +182,7 @@ def _check_names(capture: CaptureFolder) -> None:
             raise InputDataError(
                 f"{path}: [video] camera_time_offset_s names the camera '{name}', which has no directory in videos/.",
                 _listed(cameras, "cameras") + did_you_mean(name, cameras),
+                "correct the name, or remove the entry.",
             )
 
 
@@ -235,10 +236,14 @@ def _check_mask(
 ) -> None:
     path = capture.root / "masks" / name
     if path.suffix != ".png":
-        raise InputDataError(f"{path}: a mask that is no .png.", ".png; JPEG changes labels.")
+        raise InputDataError(f"{path}: a mask that is no .png.", ".png; JPEG changes labels.", "save masks as PNG.")
     photo = by_stem.get(Path(name).with_suffix(""))
     if photo is None:
-        raise InputDataError(f"{path}: there is no photo of that name in images/.", "the photo's name, with .png.")
+        raise InputDataError(
+            f"{path}: there is no photo of that name in images/.",
+            "the photo's name, with .png.",
+            "give it the name of its photo, or remove it.",
+        )
     if photo not in sizes:
         return  # the photo itself is at fault, which has been told
     labels = read_label(path)
@@ -259,7 +264,9 @@ def _check_map(
     photo = by_stem.get(Path(name).with_suffix(""))
     if photo is None:
         raise InputDataError(
-            f"{path}: there is no photo of that name in images/.", "the photo's name, its suffix replaced."
+            f"{path}: there is no photo of that name in images/.",
+            "the photo's name, its suffix replaced.",
+            "give it the name of its photo, or remove it.",
         )
     if photo not in sizes:
         return  # the photo itself is at fault, which has been told
@@ -268,6 +275,7 @@ def _check_map(
         raise InputDataError(
             f"{path}: the map has {width}x{height} px, images/{photo} has {sizes[photo][0]}x{sizes[photo][1]} px.",
             "a map of its photo's size.",
+            "make the map at the size of the photo.",
         )
     facts.geometry_maps[kind] = facts.geometry_maps.get(kind, 0) + 1
 
@@ -280,6 +288,7 @@ def _check_labels(
         raise InputDataError(
             f"{path}: the mask has {width}x{height} px, {shown} has {size[0]}x{size[1]} px.",
             "a mask of its image's size.",
+            "make the mask at the size of the picture.",
         )
     bodies = len(capture.manifest.bodies)
     if labels.max() > bodies:
@@ -315,6 +324,7 @@ def _check_cameras(capture: CaptureFolder, sizes: dict[str, tuple[int, int]], fa
                 f"{capture.root / 'images' / name}: {sizes[name][0]}x{sizes[name][1]} px, but its camera "
                 f"'{image.camera}' has {camera.width}x{camera.height} px.",
                 "the image size that the camera was calibrated for.",
+                "calibrate these photos at the size that they have.",
             )
     facts.photos_with_camera = sum(name in cameras.images for name in sizes)
     names = capture.video_cameras()
@@ -323,6 +333,7 @@ def _check_cameras(capture: CaptureFolder, sizes: dict[str, tuple[int, int]], fa
             raise InputDataError(
                 f"{capture.root / 'cameras.json'}: a camera for the videos '{name}', which are not in videos/.",
                 _listed(names, "cameras") + did_you_mean(name, names),
+                "add the videos, or remove the camera from cameras.json.",
             )
 
 
@@ -357,7 +368,9 @@ def _check_video(capture: CaptureFolder, camera: str, episode: str, facts: Captu
         files = frame_files(masks)
         if len(files) != info.frames:
             raise InputDataError(
-                f"{masks}: {len(files)} masks for {info.frames} frames.", "one mask a frame, or no directory."
+                f"{masks}: {len(files)} masks for {info.frames} frames.",
+                "one mask a frame, or no directory.",
+                "make one mask for each frame, or remove the folder.",
             )
         for file in files:
             _check_labels(capture, file, read_label(file), (info.width, info.height), f"videos/{camera}/{episode}")
@@ -372,7 +385,9 @@ def _check_video_camera(capture: CaptureFolder, camera: str, episode: str, path:
         return
     if pose_count(entry) not in (1, info.frames):
         raise InputDataError(
-            f"{path}: {info.frames} frames, but its camera has {pose_count(entry)} poses.", "one pose, or one a frame."
+            f"{path}: {info.frames} frames, but its camera has {pose_count(entry)} poses.",
+            "one pose, or one a frame.",
+            "cut the video to the frames with poses, or calibrate it again.",
         )
     intrinsics = capture.cameras.cameras[entry.camera]
     if (intrinsics.width, intrinsics.height) != (info.width, info.height):

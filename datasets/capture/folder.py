@@ -63,7 +63,9 @@ class CaptureFolder:
                 return body
         legal = ", ".join(self.body_names) or "none, [[bodies]] is empty"
         raise UsageError(
-            f"{self.root / 'capture.toml'}: no body '{name}'.", legal + "." + did_you_mean(name, self.body_names)
+            f"{self.root / 'capture.toml'}: no body '{name}'.",
+            legal + "." + did_you_mean(name, self.body_names),
+            "correct the name, or add the body to capture.toml.",
         )
 
     def surface_meshes(self) -> Mapping[str, Mesh]:
@@ -109,10 +111,18 @@ class CaptureFolder:
                 f"{where} lies outside the capture.", "a file of the capture directory.", "copy the file into it."
             )
         if optional_file(path) is None:
-            raise InputDataError(f"{where}: no such file.", "a path relative to the capture directory.")
+            raise InputDataError(
+                f"{where}: no such file.",
+                "a path relative to the capture directory.",
+                "add the file, or correct its name in capture.toml.",
+            )
         legal = (".obj", ".stl") if body.shape and body.shape.mesh else (".ply",)
         if path.suffix.lower() not in legal:
-            raise InputDataError(f"{where}: the suffix is '{path.suffix}'.", " or ".join(legal) + ".")
+            raise InputDataError(
+                f"{where}: the suffix is '{path.suffix}'.",
+                " or ".join(legal) + ".",
+                "convert the file to one of these formats.",
+            )
         return path
 
     # Photos
@@ -358,5 +368,7 @@ def _require_exerted(path: Path, body: Body, track: Track) -> None:
         )
     if track.force_n is None:
         raise InputDataError(
-            f"{path}: body '{body.name}' has a torque but no force.", "force_x_n, force_y_n and force_z_n with it."
+            f"{path}: body '{body.name}' has a torque but no force.",
+            "force_x_n, force_y_n and force_z_n with it.",
+            "add the columns force_x_n, force_y_n and force_z_n, or remove the torque.",
         )

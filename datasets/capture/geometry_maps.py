@@ -78,12 +78,20 @@ def _depth(path: Path) -> Map:
     if path.suffix.lower() == ".png":
         values = decoded(path, cv2.IMREAD_UNCHANGED)
         if values.ndim != 2 or values.dtype != np.uint16:
-            raise InputDataError(f"{path}: no image of one channel with 16 bits.", "16-bit PNG, millimetres; or .npy.")
+            raise InputDataError(
+                f"{path}: no image of one channel with 16 bits.",
+                "16-bit PNG, millimetres; or .npy.",
+                "save the depth as a PNG of 16 bits, in millimetres.",
+            )
         depth = values.astype(np.float32) * _MILLIMETRE_M
     else:
         depth = _array(path, (2,), "(H, W) [m]")
     if (depth[np.isfinite(depth)] < 0).any():
-        raise InputDataError(f"{path}: a depth below 0.", "metres along the optical axis; 0 where unknown.")
+        raise InputDataError(
+            f"{path}: a depth below 0.",
+            "metres along the optical axis; 0 where unknown.",
+            "write 0 where the depth is unknown.",
+        )
     return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
 
 
@@ -91,12 +99,20 @@ def _normals(path: Path) -> Map:
     if path.suffix.lower() == ".png":
         values = decoded(path, cv2.IMREAD_UNCHANGED)
         if values.ndim != 3 or values.shape[2] != 3 or values.dtype != np.uint8:
-            raise InputDataError(f"{path}: no RGB image with 8 bits.", "8-bit PNG, 127.5 (n + 1); or .npy.")
+            raise InputDataError(
+                f"{path}: no RGB image with 8 bits.",
+                "8-bit PNG, 127.5 (n + 1); or .npy.",
+                "save the normals as an RGB PNG of 8 bits.",
+            )
         normals = values[..., ::-1].astype(np.float32) / 127.5 - 1
     else:
         normals = _array(path, (3,), "(H, W, 3)")
         if normals.shape[2] != 3:
-            raise InputDataError(f"{path}: the shape is {normals.shape}.", "(H, W, 3).")
+            raise InputDataError(
+                f"{path}: the shape is {normals.shape}.",
+                "(H, W, 3).",
+                "save one normal of three numbers for each pixel.",
+            )
     length = np.linalg.norm(normals, axis=2, keepdims=True)
     known = np.isfinite(length) & (length > _LEAST_NORMAL)
     return np.where(known, normals / np.where(known, length, 1), 0).astype(np.float32)
@@ -105,12 +121,18 @@ def _normals(path: Path) -> Map:
 def _features(path: Path) -> Map:
     features = _array(path, (3,), "(h, w, F)")
     if not np.isfinite(features).all():
-        raise InputDataError(f"{path}: values that are not finite.", "finite numbers.")
+        raise InputDataError(
+            f"{path}: values that are not finite.", "finite numbers.", "write 0 where a value is unknown."
+        )
     return features
 
 
 def _array(path: Path, dimensions: tuple[int, ...], wanted: str) -> Map:
     array = read_npy(path)
     if array.ndim not in dimensions or array.dtype.kind != "f" or not array.size:
-        raise InputDataError(f"{path}: {array.dtype} {array.shape}.", f"floating-point numbers, {wanted}.")
+        raise InputDataError(
+            f"{path}: {array.dtype} {array.shape}.",
+            f"floating-point numbers, {wanted}.",
+            "save the map in one of these forms.",
+        )
     return array.astype(np.float32)

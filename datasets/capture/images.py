@@ -62,7 +62,11 @@ def read_alpha(path: Path | str) -> NDArray[np.uint8]:
     """
     image = decoded(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 3 or image.shape[2] != 4 or image.dtype != np.uint8:
-        raise InputDataError(f"{path}: a picture without opacity.", "four channels of 8 bits.")
+        raise InputDataError(
+            f"{path}: a picture without opacity.",
+            "four channels of 8 bits.",
+            "save the picture as PNG with an alpha channel.",
+        )
     return image[..., 3]
 
 

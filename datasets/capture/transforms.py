@@ -122,7 +122,11 @@ def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrin
         )
     values = {name: _number(where, fields, name) for name in _INTRINSICS if name in fields}
     if values.get("k4"):
-        raise InputDataError(f"{where}: k4 = {values['k4']:g}.", "distortion by k1, k2, p1, p2, k3.")
+        raise InputDataError(
+            f"{where}: k4 = {values['k4']:g}.",
+            "distortion by k1, k2, p1, p2, k3.",
+            "undistort the pictures, or fit their camera without k4.",
+        )
     if "w" in values and "h" in values:
         width, height = round(values["w"]), round(values["h"])
     else:

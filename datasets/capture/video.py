@@ -49,7 +49,11 @@ def frame_files(folder: Path) -> list[Path]:
     numbered: dict[int, Path] = {}
     for file in files:
         if not (file.stem.isascii() and file.stem.isdecimal()):
-            raise InputDataError(f"{file}: the name is no frame number.", "000000.png, 000001.png, ...")
+            raise InputDataError(
+                f"{file}: the name is no frame number.",
+                "000000.png, 000001.png, ...",
+                "name frames by their numbers, such as 000012.png.",
+            )
         number = int(file.stem)
         if number in numbered:
             raise InputDataError(
@@ -115,7 +119,11 @@ def read_video_labels(folder: Path) -> NDArray[np.uint8]:
 def _folder_info(folder: Path) -> VideoInfo:
     files = frame_files(folder)
     if not files:
-        raise InputDataError(f"{folder}: no frames.", "000000.png, 000001.png, ... or .jpg.")
+        raise InputDataError(
+            f"{folder}: no frames.",
+            "000000.png, 000001.png, ... or .jpg.",
+            "put the frames of the video into it, named by their numbers.",
+        )
     width, height = image_size(files[0])
     for file in files[1:]:
         size = image_size(file)
@@ -123,6 +131,7 @@ def _folder_info(folder: Path) -> VideoInfo:
             raise InputDataError(
                 f"{file}: {size[0]}x{size[1]} px, but {files[0].name} has {width}x{height} px.",
                 "frames of one size.",
+                "make all frames of a video of one size.",
             )
     return VideoInfo(len(files), width, height)
 

@@ -83,7 +83,11 @@ def import_arkit(source: Path | str, out: Path | str, photos: int = 60, overwrit
         for one in taken:
             fault = pose_fault(one.T_world_cam)
             if fault is not None:
-                raise InputDataError(f"{one.where}: {fault}.", "a rotation and a position in metres.")
+                raise InputDataError(
+                    f"{one.where}: {fault}.",
+                    "a rotation and a position in metres.",
+                    "take the file of the original recording.",
+                )
             key = next((key for key, known in cameras.items() if known == one.camera), f"camera{len(cameras)}")
             cameras[key] = one.camera
             images[one.name] = PosedImage(camera=key, T_world_cam=matrix4(one.T_world_cam))
@@ -131,7 +135,9 @@ def _odometry(path: Path) -> dict[int, tuple[NDArray[np.float64], dict[str, floa
     header = rows[0][1] if rows else []
     if not {"frame", *_ODOMETRY} <= set(header):
         raise InputDataError(
-            f"{path}: the columns {', '.join(header[:12]) or 'none'}.", f"timestamp, frame, {', '.join(_ODOMETRY)}."
+            f"{path}: the columns {', '.join(header[:12]) or 'none'}.",
+            f"timestamp, frame, {', '.join(_ODOMETRY)}.",
+            "export the trajectory again.",
         )
     found: dict[int, tuple[NDArray[np.float64], dict[str, float]]] = {}
     own = [name for name in _INTRINSICS if name in header] if set(_INTRINSICS) <= set(header) else []
@@ -148,7 +154,11 @@ def _odometry(path: Path) -> dict[int, tuple[NDArray[np.float64], dict[str, floa
 def _matrix(path: Path) -> dict[str, float]:
     rows = [line.split(",") for line in read_text_file(path).splitlines() if line.strip()]
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
-        raise InputDataError(f"{path}: not a matrix of 3 x 3 numbers.", "fx, 0, cx / 0, fy, cy / 0, 0, 1.")
+        raise InputDataError(
+            f"{path}: not a matrix of 3 x 3 numbers.",
+            "fx, 0, cx / 0, fy, cy / 0, 0, 1.",
+            "take the file of the original recording.",
+        )
     K = np.array([_numbers(row, str(path)) for row in rows])
     return {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
 
@@ -165,13 +175,18 @@ def _scenes(source: Path, directory: Path, most: int) -> tuple[list[_Taken], lis
         raise InputDataError(
             f"{source}: {len(files)} photos in lowres_wide/, none with a pose in lowres_wide.traj within 5 ms.",
             "photos <video>_<seconds>.png.",
+            "take the photos and lowres_wide.traj of one recording.",
         )
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))
     taken, sources = [], []
     for path, pose in (pairs[k] for k in chosen):
         camera = _pincam(source / "lowres_wide_intrinsics", path)
         if (camera.width, camera.height) != image_size(path):
-            raise InputDataError(f"{path}: not of the size of its .pincam.", f"{camera.width}x{camera.height} px.")
+            raise InputDataError(
+                f"{path}: not of the size of its .pincam.",
+                f"{camera.width}x{camera.height} px.",
+                "take photo and .pincam of one recording.",
+            )
         taken.append(_Taken(path.name, camera, pose, f"{source / 'lowres_wide.traj'}: the pose of {path.name}"))
         sources.append(Photo(path, path.name))
     copy_photos(directory, sources)
@@ -189,7 +204,11 @@ def _trajectory(path: Path) -> tuple[NDArray[np.float64], list[NDArray[np.float6
         where = f"{path}: line {number}"
         values = _numbers(line.split(), where)
         if len(values) != 7:
-            raise InputDataError(f"{where}: {len(values)} numbers.", "seconds, axis times angle, position: seven.")
+            raise InputDataError(
+                f"{where}: {len(values)} numbers.",
+                "seconds, axis times angle, position: seven.",
+                "take the file of the original recording.",
+            )
         world_to_cam = np.eye(4)
         world_to_cam[:3, :3] = Rotation.from_rotvec(values[1:4]).as_matrix()
         world_to_cam[:3, 3] = values[4:]
@@ -207,7 +226,9 @@ def _pincam(folder: Path, photo: Path) -> CameraIntrinsics:
         raise InputDataError(f"{folder}: no {names[0]} for {photo.name}.", todo="download the intrinsics, too.")
     values = _numbers(read_text_file(path).split(), str(path))
     if len(values) != 6 or min(values[:2]) < 1:
-        raise InputDataError(f"{path}: not six numbers.", "width height fx fy cx cy.")
+        raise InputDataError(
+            f"{path}: not six numbers.", "width height fx fy cx cy.", "take the file of the original recording."
+        )
     lens = dict(zip(_INTRINSICS, values[2:], strict=True))
     size = {"width": int(values[0]), "height": int(values[1])}
     return CameraIntrinsics.of_lens(str(path), **size, **lens, distortion=())

@@ -57,7 +57,9 @@ def import_balldrops(
         recordings = _drops(path)
         balls = list(dict.fromkeys(str(recording.group) for recording in recordings))
         if only is not None and only not in balls:
-            raise InputDataError(f"{path}: no ball '{only}'.", f"{', '.join(balls)}.")
+            raise InputDataError(
+                f"{path}: no ball '{only}'.", f"{', '.join(balls)}.", "pass one of these with --only, or leave it out."
+            )
         recordings = [recording for recording in recordings if only in (None, recording.group)]
         body = _body(path.with_name(_TABLE), balls, only)
         splits = {
@@ -85,7 +87,9 @@ def _drops(path: Path) -> list[Recording]:
                 raise ValueError
             sample = number_of(row["Time (s)"]), number_of(row["Height (m)"])
         except (KeyError, ValueError, OverflowError):
-            raise InputDataError(f"{path}, line {line}: no drop number, time and height.", "numbers.") from None
+            raise InputDataError(
+                f"{path}, line {line}: no drop number, time and height.", "numbers.", "correct the line, or remove it."
+            ) from None
         if (name, number) not in drops:
             require_name(name, f"{path}, line {line}")
         drops.setdefault((name, number), []).append(sample)
@@ -124,7 +128,11 @@ def _table(path: Path) -> dict[str, tuple[float | None, float | None]]:
             if not all(value is None or 0 < value < math.inf for value in (mass, radius)):
                 raise ValueError
         except ValueError:
-            raise InputDataError(f"{path}, line {number}: {shown(line)}.", "ball, ounces, centimetres.") from None
+            raise InputDataError(
+                f"{path}, line {number}: {shown(line)}.",
+                "ball, ounces, centimetres.",
+                "correct the line, or remove it.",
+            ) from None
         table[_key(name)] = mass, radius
     return table
 

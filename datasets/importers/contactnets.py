@@ -131,7 +131,9 @@ def _read_pt(files: list[Path]) -> _Tosses:
     tracks: dict[int, Track] = {}
     for file in progress(files, "reading", unit="toss"):
         if not file.stem.isdecimal():
-            raise InputDataError(f"{file}: the name is no toss number.", "<number>.pt.")
+            raise InputDataError(
+                f"{file}: the name is no toss number.", "<number>.pt.", "name the files by the numbers of the tosses."
+            )
         rows = read_tensor(file, _COLUMNS, batched=True)
         rows[:, _POSITION] *= HALF_WIDTH_M
         rows[:, _VELOCITY] *= HALF_WIDTH_M
@@ -144,18 +146,27 @@ def _read_npz(path: Path) -> _Tosses:
     for name, dimensions in (("offsets", 1), ("toss_index", 1), ("rate_hz", 0), ("half_width_m", 0), ("pos", 2)):
         if data[name].ndim != dimensions or data[name].dtype.kind not in "iuf":
             raise InputDataError(
-                f"{path}: '{name}' is {data[name].dtype} {data[name].shape}.", f"numbers with {dimensions} axes."
+                f"{path}: '{name}' is {data[name].dtype} {data[name].shape}.",
+                f"numbers with {dimensions} axes.",
+                "take the original file.",
             )
     for name, width in (("pos", 3), ("quat_wxyz", 4), ("vel", 3), ("omega_body", 3)):
         if data[name].shape != (len(data["pos"]), width):
-            raise InputDataError(f"{path}: '{name}' has the shape {data[name].shape}.", f"(rows, {width}).")
+            raise InputDataError(
+                f"{path}: '{name}' has the shape {data[name].shape}.", f"(rows, {width}).", "take the original file."
+            )
     if not (data["rate_hz"] > 0 and data["half_width_m"] > 0):
-        raise InputDataError(f"{path}: rate_hz {data['rate_hz']}, half_width_m {data['half_width_m']}.", "both > 0.")
+        raise InputDataError(
+            f"{path}: rate_hz {data['rate_hz']}, half_width_m {data['half_width_m']}.",
+            "both > 0.",
+            "take the original file.",
+        )
     offsets, numbers = data["offsets"].astype(np.int64), data["toss_index"].astype(np.int64)
     if len(offsets) != len(numbers) + 1 or offsets[0] != 0 or offsets[-1] != len(data["pos"]):
         raise InputDataError(
             f"{path}: {len(numbers)} toss numbers, {len(offsets)} offsets, {len(data['pos'])} rows.",
             "one offset more than tosses, from 0 to the number of rows.",
+            "take the original file.",
         )
     tracks: dict[int, Track] = {}
     for number, start, stop in zip(numbers, offsets[:-1], offsets[1:], strict=True):

@@ -90,14 +90,20 @@ def _unpacked(source: Path) -> Iterator[Path]:
                     if not entry.isfile() or name.suffix not in (".pt", ".urdf"):
                         continue
                     if entry.size > _MOST_BYTES or number > 100_000:
-                        raise InputDataError(f"{source}: '{name}' is too large.", f"up to {_MOST_BYTES} bytes.")
+                        raise InputDataError(
+                            f"{source}: '{name}' is too large.",
+                            f"up to {_MOST_BYTES} bytes.",
+                            "take the original archive.",
+                        )
                     content = archive.extractfile(entry)
                     # names alone, so that nothing is written elsewhere
                     (Path(place) / name.name).write_bytes(b"" if content is None else content.read())
         except (tarfile.TarError, EOFError, OSError) as error:
             if isinstance(error, InputDataError):
                 raise
-            raise InputDataError(f"{source}: it is no archive that can be read.", "a folder, or a .tar.xz.") from None
+            raise InputDataError(
+                f"{source}: it is no archive that can be read.", "a folder, or a .tar.xz.", "download it again."
+            ) from None
         yield Path(place)
 
 
@@ -131,10 +137,18 @@ def _tracks(file: Path, hinge: JointOfRobot) -> dict[str, Track]:
     """Return the tracks of both links of a toss."""
     rows = read_tensor(file, _COLUMNS)
     if len(rows) < 2 or not np.isfinite(rows).all():
-        raise InputDataError(f"{file.name}: {len(rows)} frames, or numbers that are not finite.", "2 or more, finite.")
+        raise InputDataError(
+            f"{file.name}: {len(rows)} frames, or numbers that are not finite.",
+            "2 or more, finite.",
+            "take the original file.",
+        )
     norms = np.linalg.norm(rows[:, :4], axis=1)
     if (np.abs(norms - 1) > 1e-3).any():
-        raise InputDataError(f"{file.name}: a quaternion has norm {norms[np.abs(norms - 1).argmax()]:.4f}.", "norm 1.")
+        raise InputDataError(
+            f"{file.name}: a quaternion has norm {norms[np.abs(norms - 1).argmax()]:.4f}.",
+            "norm 1.",
+            "take the original file.",
+        )
     time, quat, position = np.arange(len(rows), dtype=np.float64) * STEP_S, rows[:, :4] / norms[:, None], rows[:, 4:7]
     turns = np.stack([matrix_of(one) for one in quat])
     place = position + turns @ hinge.position_m

@@ -73,6 +73,7 @@ def import_hdf5(
                 raise InputDataError(
                     f"--columns: '{name}' is nothing that a set can be.",
                     f"{', '.join(SETS)}.{did_you_mean(name, SETS)}",
+                    "correct the name before the =.",
                 )
         require_name(body, "--body")
         files = track_files(Path(source), (".h5", ".hdf5"))
@@ -124,7 +125,11 @@ def _numbers(path: Path, item: h5py.Dataset, key: str) -> Array:
     where, width = f"{path}: {item.name}", _WIDTHS[key]
     wanted = "(T, " + ", ".join(map(str, width)) + ")" if width else "(T,)"
     if item.dtype.kind not in "fiu" or item.shape is None or item.ndim != 1 + len(width) or item.shape[1:] != width:
-        raise InputDataError(f"{where} has the shape {item.shape} and the type {item.dtype}.", f"numbers, {wanted}.")
+        raise InputDataError(
+            f"{where} has the shape {item.shape} and the type {item.dtype}.",
+            f"numbers, {wanted}.",
+            "name the right set with --columns, or write it in this form.",
+        )
     if len(item) > MOST_ROWS:
         raise InputDataError(f"{where} declares {len(item)} rows.", f"up to {MOST_ROWS} rows.", "split the recording.")
     require_stored(item, where)
@@ -133,7 +138,9 @@ def _numbers(path: Path, item: h5py.Dataset, key: str) -> Array:
 
 def _orientation(where: str, group: h5py.Group, wxyz: Array | None, xyzw: Array | None) -> Array | None:
     if wxyz is not None and xyzw is not None:
-        raise InputDataError(f"{where}: quaternions in both orders.", "one set of them.")
+        raise InputDataError(
+            f"{where}: quaternions in both orders.", "one set of them.", "name the one to use with --columns."
+        )
     unsaid = [name for name in ("quat", "quaternion", "orientation", "rotation") if name in group]
     if wxyz is None and xyzw is None and unsaid:
         raise InputDataError(

@@ -169,7 +169,11 @@ def _sessions(source: Path, only: str | None) -> list[Path]:
         what = "no sessions of Jugglebot" if source.exists() else "no such file or directory"
         raise InputDataError(f"{source}: {what}.", "a session's .json or .npz, or a directory of them.", _TODO)
     if only is not None and only not in by_name:
-        raise InputDataError(f"{source}: no session '{only}'.", f"{', '.join(sorted(by_name))}.")
+        raise InputDataError(
+            f"{source}: no session '{only}'.",
+            f"{', '.join(sorted(by_name))}.",
+            "pass one of these with --only, or leave it out.",
+        )
     return [path for name, path in sorted(by_name.items()) if only in (None, name)]
 
 

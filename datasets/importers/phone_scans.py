@@ -195,7 +195,9 @@ def _numbered(photos: list[Photo], count: int, path: Path) -> list[tuple[int, Ph
         stem = photo.source.stem
         if not (stem.isascii() and stem.isdecimal()) or int(stem) >= count:
             raise InputDataError(
-                f"{photo.source}: no number of one of the {count} poses of {path.name}.", "0.jpg, 1.jpg, ..."
+                f"{photo.source}: no number of one of the {count} poses of {path.name}.",
+                "0.jpg, 1.jpg, ...",
+                "take photos and poses of one recording.",
             )
         found.append((int(stem), photo))
     return sorted(found, key=lambda one: one[0])
@@ -225,6 +227,7 @@ def sure_depth(path: Path, confidence: Path | None) -> NDArray[np.uint16]:
             f"{confidence}: {sure.shape[1]}x{sure.shape[0]} px, but the depth has "
             f"{depth.shape[1]}x{depth.shape[0]} px.",
             "maps of one size.",
+            "take both of one recording.",
         )
     return np.where(sure >= _UNSURE, depth, 0).astype(np.uint16)
 
@@ -241,5 +244,6 @@ def _grey(path: Path, kind: Any) -> np.ndarray:
         raise InputDataError(
             f"{path}: {1 if values.ndim == 2 else values.shape[2]} channel(s) of {8 * values.dtype.itemsize} bits.",
             f"one channel of {8 * np.dtype(kind).itemsize} bits.",
+            "take the file of the original recording.",
         )
     return values

@@ -174,7 +174,11 @@ def opened(path: Path) -> Iterator[RealSenseFile]:
     except ImportError:
         raise UsageError("RealSense recordings need the package rosbags.", todo="pip install 'cgwm[ros]'.") from None
     if path.suffix.lower() not in (".bag", ".db3"):
-        raise InputDataError(f"{path}: no recording of a RealSense camera.", "a .bag or .db3 of librealsense.")
+        raise InputDataError(
+            f"{path}: no recording of a RealSense camera.",
+            "a .bag or .db3 of librealsense.",
+            "name a .bag file that a RealSense camera has recorded.",
+        )
     require_regular_file(path)
     try:
         with _bag(path) if path.suffix.lower() == ".bag" else _database(path) as topics:

@@ -90,6 +90,7 @@ def _bags(source: Path) -> list[Path]:
         raise InputDataError(
             f"{source}: {what if there else 'no such file or directory'}.",
             "a .bag, a .mcap, a directory with metadata.yaml, or a folder of them.",
+            "name the bag's .mcap or .bag file, or its folder.",
         )
     return bags
 

@@ -67,7 +67,11 @@ def _track(path: Path, units: Units) -> Track:
         except ValueError:
             values = []
         if len(values) != 8 or any(map(math.isinf, values)):
-            raise InputDataError(f"{path}, line {number}: {shown(line)}.", "8 numbers: timestamp tx ty tz qx qy qz qw.")
+            raise InputDataError(
+                f"{path}, line {number}: {shown(line)}.",
+                "8 numbers: timestamp tx ty tz qx qy qz qw.",
+                "correct the line, or remove it.",
+            )
         rows.append(values)
     table = np.array(rows).reshape(-1, 8)
     return units.track(str(path), table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]])

@@ -42,16 +42,23 @@ def read_npz(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
             found: dict[str, NDArray[Any]] = {}
             for name in names:
                 if name not in members:
-                    raise InputDataError(f"{path}: no array '{name}'.", allowed)
+                    raise InputDataError(
+                        f"{path}: no array '{name}'.", allowed, "add the array, or take the original file."
+                    )
                 if members[name].file_size > MOST_UNPACKED:
                     raise InputDataError(
                         f"{path}: '{name}' declares {members[name].file_size / 2**30:.1f} GiB.",
                         f"arrays of at most {MOST_UNPACKED / 2**30:g} GiB.",
+                        "take the original file.",
                     )
                 found[name] = _parsed(f"{path}: not an .npz that can be read: '{name}'", archive.read(members[name]))
             return found
     except (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError, ValueError) as error:
-        raise InputDataError(f"{path}: not an .npz that can be read: {error}.", allowed) from None
+        raise InputDataError(
+            f"{path}: not an .npz that can be read: {error}.",
+            allowed,
+            "take the original file, or write it again with numpy.savez.",
+        ) from None
 
 
 def _parsed(where: str, data: bytes) -> NDArray[Any]:

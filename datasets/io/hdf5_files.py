@@ -82,7 +82,11 @@ def own_objects(group: h5py.Group, where: str) -> Iterator[tuple[str, h5py.Group
         if not isinstance(item, h5py.Group):
             continue
         if place.count("/") > MOST_DEEP or len(seen) + len(pending) > MOST_OBJECTS:
-            raise InputDataError(f"{where}/{place[:80]}: groups without end.", f"{MOST_DEEP} groups in each other.")
+            raise InputDataError(
+                f"{where}/{place[:80]}: groups without end.",
+                f"{MOST_DEEP} groups in each other.",
+                "take the original file.",
+            )
         inside: list[tuple[str, Any]] = []
         for name in sorted(item):
             path = f"{place}/{name}".lstrip("/")
@@ -147,7 +151,9 @@ def require_stored(
     made = item.id.get_create_plist()
     if made.get_external_count():
         raise InputDataError(
-            f"{where}: its numbers lie in another file, {(item.external or [['']])[0][0]}.", "arrays in the file."
+            f"{where}: its numbers lie in another file, {(item.external or [['']])[0][0]}.",
+            "arrays in the file.",
+            "write the numbers into the file itself.",
         )
     if made.get_layout() == h5py.h5d.VIRTUAL:
         _require_sources(item, where, files or {}, depth)
@@ -157,7 +163,11 @@ def require_stored(
     if chunks is not None:
         chunk = math.prod(chunks) * item.dtype.itemsize
         if chunk > MOST_CHUNK_BYTES:
-            raise InputDataError(f"{where}: chunks of {chunk / 2**30:.1f} GiB.", f"{MOST_CHUNK_BYTES / 2**30:g} GiB.")
+            raise InputDataError(
+                f"{where}: chunks of {chunk / 2**30:.1f} GiB.",
+                f"{MOST_CHUNK_BYTES / 2**30:g} GiB.",
+                "write the file with smaller chunks.",
+            )
     stored = item.id.get_storage_size()
     whole = stored > 0
     if whole and size > NEEDS_NO_PROOF_BYTES:
@@ -170,6 +180,7 @@ def require_stored(
         raise InputDataError(
             f"{where}: declares {item.dtype} {item.shape}, {size / 2**20:.3g} MiB, of which {stored} bytes are stored.",
             "arrays that are written completely.",
+            "take the original file.",
         )
 
 
@@ -177,10 +188,18 @@ def _require_sources(item: h5py.Dataset, where: str, files: Mapping[str, Callabl
     """Refuse a virtual array that looks elsewhere than into the given files, or whose sources do not cover it."""
     covered = 0
     if depth > 1:
-        raise InputDataError(f"{where}: a virtual array of virtual arrays.", "arrays in files.")
+        raise InputDataError(
+            f"{where}: a virtual array of virtual arrays.",
+            "arrays in files.",
+            "write the numbers into the file itself.",
+        )
     for source in item.virtual_sources():
         if source.file_name != "." and source.file_name not in files:
-            raise InputDataError(f"{where}: looks into another file, {source.file_name}.", "the files of the dataset.")
+            raise InputDataError(
+                f"{where}: looks into another file, {source.file_name}.",
+                "the files of the dataset.",
+                "write the numbers into the file itself.",
+            )
         taken = source.vspace.get_select_npoints()
         covered += taken
         if source.file_name == ".":

@@ -169,5 +169,9 @@ def _free_name(body: str, suffix: str, taken: set[str]) -> str:
 def _inside(root: Path, name: str) -> Path:
     path = root / name
     if not real_path(path).is_relative_to(real_path(root)):
-        raise InputDataError(f"{root / 'model.json'}: '{name}' lies outside the model.", "files of its directory.")
+        raise InputDataError(
+            f"{root / 'model.json'}: '{name}' lies outside the model.",
+            "files of its directory.",
+            "copy the file into the model, and name it there.",
+        )
     return path

@@ -67,7 +67,11 @@ def read_mesh(path: Path | str, merge: bool = True) -> Mesh:
     path = Path(path)
     readers = {".obj": _read_obj, ".stl": _read_stl}
     if path.suffix.lower() not in readers:
-        raise InputDataError(f"{path}: a mesh with the suffix '{path.suffix}'.", ".obj or .stl.")
+        raise InputDataError(
+            f"{path}: a mesh with the suffix '{path.suffix}'.",
+            ".obj or .stl.",
+            "convert the mesh to one of these formats.",
+        )
     data = read_binary_file(path, MOST_BYTES)
     try:
         mesh = readers[path.suffix.lower()](data)
@@ -138,7 +142,11 @@ def solid_properties(mesh: Mesh, path: Path | str = "mesh") -> SolidProperties:
     six_volume = float(six_volumes.sum())
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if abs(six_volume) < 1e-9 * extent**3:
-        raise InputDataError(f"{path}: the mesh encloses no volume.", "a closed surface around a solid.")
+        raise InputDataError(
+            f"{path}: the mesh encloses no volume.",
+            "a closed surface around a solid.",
+            "close the mesh, or describe the shape by spheres or a box.",
+        )
     sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     twice_area = float(np.linalg.norm(np.cross(*sides), axis=1).sum())
     # that of a plate; of other solids their volume over half of their surface

@@ -150,6 +150,7 @@ def read_splats(path: Path | str, harmonics: bool = False) -> Splats:
         raise InputDataError(
             f"{path}: the logarithm of a scale of {far} splats is {log_scales.flat[np.abs(log_scales).argmax()]:.4g}.",
             f"-{_MOST_LOG_SCALE:g} to {_MOST_LOG_SCALE:g}.",
+            "train the splats again, or remove these.",
         )
     colors = 0.5 + SH_C0 * np.stack([table[f"f_dc_{k}"] for k in range(3)], axis=1)
     higher = _harmonics(path, columns) if harmonics else None
@@ -166,7 +167,7 @@ def read_splats(path: Path | str, harmonics: bool = False) -> Splats:
 def _require_metres(path: Path, comments: list[str]) -> None:
     unit = next((comment.split()[1] for comment in comments if comment.startswith("unit ")), "metre")
     if unit not in ("metre", "meter", "m"):
-        raise InputDataError(f"{path}: its header says 'comment unit {unit}'.", "metre.")
+        raise InputDataError(f"{path}: its header says 'comment unit {unit}'.", "metre.", "scale the splats to metres.")
 
 
 def _finite_columns(path: Path, columns: dict[str, Array]) -> dict[str, NDArray[np.float64]]:
@@ -176,6 +177,7 @@ def _finite_columns(path: Path, columns: dict[str, Array]) -> dict[str, NDArray[
         raise InputDataError(
             f"{path}: no property '{lacking[0]}'; it is no 3D Gaussian splatting file.",
             "the properties " + ", ".join(_NEEDED) + ".",
+            "export the splats from their training again.",
         )
     table = {name: np.asarray(columns[name], np.float64) for name in _NEEDED}
     for name, values in table.items():
@@ -193,7 +195,11 @@ def _harmonics(path: Path, columns: dict[str, Array]) -> Array | None:
     if count == 0:
         return None
     if count % 3 or count // 3 not in _HIGHER_TERMS or any(f"f_rest_{k}" not in columns for k in range(count)):
-        raise InputDataError(f"{path}: {count} properties 'f_rest_*'.", "9, 24 or 45 of them, of degree 1, 2 or 3.")
+        raise InputDataError(
+            f"{path}: {count} properties 'f_rest_*'.",
+            "9, 24 or 45 of them, of degree 1, 2 or 3.",
+            "export the splats with all harmonics of a degree.",
+        )
     values = np.stack([np.asarray(columns[f"f_rest_{k}"], np.float64) for k in range(count)], axis=1)
     if not np.isfinite(values).all():
         bad = int((~np.isfinite(values)).any(1).sum())

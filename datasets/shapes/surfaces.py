@@ -149,9 +149,17 @@ def _heights(path: Path) -> Array:
         good = grid.ndim == 2 and min(grid.shape, default=0) >= 2
         found, white = f"a picture of shape {grid.shape}", float(np.iinfo(grid.dtype.name).max)
     else:
-        raise InputDataError(f"{path}: a height field with the suffix '{path.suffix}'.", ".png or .npy.")
+        raise InputDataError(
+            f"{path}: a height field with the suffix '{path.suffix}'.",
+            ".png or .npy.",
+            "save the heights as .npy or .npz.",
+        )
     if not good:
-        raise InputDataError(f"{path}: {found}.", "a grey picture, or numbers in rows and columns, at least 2 x 2.")
+        raise InputDataError(
+            f"{path}: {found}.",
+            "a grey picture, or numbers in rows and columns, at least 2 x 2.",
+            "correct the file, or take the original.",
+        )
     return grid.astype(float) / white
 
 

@@ -23,6 +23,7 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
         raise InputDataError(
             f"capture.toml: calibration.aruco_dictionary: unknown dictionary '{name}'.",
             ", ".join(legal) + "." + did_you_mean(name, legal),
+            "name the dictionary that the markers were printed from.",
         )
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, _PREFIX + name))
 

@@ -72,7 +72,11 @@ def print_target(path: Path | str, overwrite: bool = False) -> TargetSheet:
     path = Path(path)
     writers = {".pdf": _pdf, ".svg": _svg}
     if path.suffix.lower() not in writers:
-        raise UsageError(f"{path}: a board is printed from .pdf or .svg.", "a name with one of these suffixes.")
+        raise UsageError(
+            f"{path}: a board is printed from .pdf or .svg.",
+            "a name with one of these suffixes.",
+            "choose a name with one of these endings.",
+        )
     with new_file(path, "calibration target", overwrite) as temporary:
         temporary.write_bytes(writers[path.suffix.lower()](black_rectangles()))
     return TargetSheet(path=str(path), width_mm=COLUMNS * SQUARE_MM, height_mm=ROWS * SQUARE_MM, square_mm=SQUARE_MM)

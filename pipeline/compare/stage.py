@@ -216,7 +216,7 @@ def _refuse_twice(models: Sequence[Path]) -> None:
     places = [real_path(path) for path in models]
     twice = next((path for k, path in enumerate(models) if places[k] in places[:k]), None)
     if twice is not None:
-        raise UsageError(f"{twice}: this model is given twice.", "each model once.")
+        raise UsageError(f"{twice}: this model is given twice.", "each model once.", "leave the second one out.")
 
 
 def _check(name: str, model: Model, capture: Capture) -> None:

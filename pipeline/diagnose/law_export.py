@@ -68,7 +68,11 @@ def require_law_file(path: Path, overwrite: bool) -> None:
             wrote and nobody has changed is compared with the new one first.
     """
     if path.suffix != ".py":
-        raise UsageError(f"{path}: an effect is a Python file.", "a name that ends with .py.")
+        raise UsageError(
+            f"{path}: an effect is a Python file.",
+            "a name that ends with .py.",
+            "end the name with .py: --save-law FILE.py.",
+        )
     if overwrite or not is_own_file(path, "effect"):
         refuse_output(path, "effect", overwrite)
 

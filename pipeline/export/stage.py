@@ -154,7 +154,11 @@ def export(
     _refuse_kind(thing, format_)
     suffix = SUFFIXES.get(format_)
     if suffix and out.suffix.lower() != suffix:
-        raise UsageError(f"--out {out}: --to {format_} writes one file.", f"a name that ends in {suffix}.")
+        raise UsageError(
+            f"--out {out}: --to {format_} writes one file.",
+            f"a name that ends in {suffix}.",
+            "choose a name with that ending.",
+        )
     kind = "splat folder" if format_ == "ply" and out.suffix.lower() != ".ply" else _KINDS[format_]
     refuse_output(out, kind, overwrite or may_repeat(out, kind))
     facts, notes = _WORK[format_](thing, out, chosen, overwrite)
@@ -168,6 +172,7 @@ def _refuse_kind(thing: Path, format_: ExportFormat) -> None:
         raise InputDataError(
             f"{thing} is a {found}; --to {format_} takes a {wanted}.",
             f"for a dataset: {', '.join(DATASET_FORMATS)}; for a model: {', '.join(MODEL_FORMATS)}.",
+            "name one, or choose another format with --to.",
         )
     refuse_other_kind(thing, wanted)
 
@@ -211,7 +216,11 @@ def _mjcf(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tu
     from .mujoco_check import AFTER_CONTACT_S, keyframe_of, link_deviation, resimulate, start_of
 
     if not LEAST_DURATION_S <= options.duration_s <= MOST_DURATION_S:
-        raise UsageError(f"--duration {options.duration_s:g} s.", f"{LEAST_DURATION_S:g} to {MOST_DURATION_S:g} s.")
+        raise UsageError(
+            f"--duration {options.duration_s:g} s.",
+            f"{LEAST_DURATION_S:g} to {MOST_DURATION_S:g} s.",
+            "pass a duration in seconds.",
+        )
     model = _simulated(thing)
     if model.file.articulations:
         text = write_mjcf(model, source=f"cgwm, of {model.file.provenance.capture}")
@@ -314,7 +323,9 @@ def _surfaces_of_bodies(model: Model) -> dict[str, ObjectModel]:
 def _ply(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> tuple[Facts, list[str]]:
     model = _visible(thing)
     if not 0 <= options.sh_degree <= 3:
-        raise UsageError(f"--sh-degree {options.sh_degree}: not a degree of harmonics.", "0 to 3.")
+        raise UsageError(
+            f"--sh-degree {options.sh_degree}: not a degree of harmonics.", "0 to 3.", "pass one of these degrees."
+        )
     counts = write_splat_files(out, model, options.sh_degree, overwrite)
     return {f"{name}_spheres": count for name, count in counts.items()}, _light_notes(model)
 

@@ -109,6 +109,7 @@ def _require_fittable(model: Model, capture: Capture, config: PhysConfig) -> Non
         raise InputDataError(
             f"{capture.root / 'capture.toml'}: no body is free, so no motion contains information about contact.",
             'motion = "free" for the body whose physics is wanted.',
+            "write it under that body's [[bodies]], or fit the geometry alone: --stage sg-gs.",
         )
 
 

@@ -491,7 +491,9 @@ def _active(entry: EffectModel, where: str, like: Tensor) -> ActiveEffect:
         low = 0.0 if number.nonnegative else -number.limit
         if not low <= value <= number.limit:
             raise InputDataError(
-                f"{where}: {effect.name}.{number.name} is {value:g} {number.unit}.", f"{low:g} to {number.limit:g}."
+                f"{where}: {effect.name}.{number.name} is {value:g} {number.unit}.",
+                f"{low:g} to {number.limit:g}.",
+                "correct the value in model.json, or fit the model again.",
             )
     return active
 

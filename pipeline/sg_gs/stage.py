@@ -167,7 +167,11 @@ def _open(capture: Capture, config: SplatConfig, checkpoint: Checkpoint | None) 
         )
     known = [name for name in names if name in capture.cameras.images]
     if len(known) < _MIN_PHOTOS:
-        raise InputDataError(f"{capture.root}: {len(known)} of {len(names)} photos have a camera.", "at least 3.")
+        raise InputDataError(
+            f"{capture.root}: {len(known)} of {len(names)} photos have a camera.",
+            "at least 3.",
+            "run 'cgwm calibrate' on more photos, or remove those without a camera.",
+        )
     if len(known) < len(names):
         stage.warnings.append(f"{len(names) - len(known)} of {len(names)} photos have no camera and were not used.")
     if ground is not None and capture.cameras.scale.kind == "unscaled":

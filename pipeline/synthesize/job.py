@@ -107,7 +107,9 @@ def prepared(path: Path, config: SynthesizeConfig, out: Path | None = None) -> J
     count = round(config.duration_s * config.frame_rate_hz) + 1
     if count < 2:
         raise UsageError(
-            f"{config.duration_s:g} s at {config.frame_rate_hz:g} frames/s is one frame.", "two frames or more."
+            f"{config.duration_s:g} s at {config.frame_rate_hz:g} frames/s is one frame.",
+            "two frames or more.",
+            "raise synthesize.duration_s or synthesize.frame_rate_hz.",
         )
     device = str(resolve_device(config.device))
     visible = bool(model.body_splats)

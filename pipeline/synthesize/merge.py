@@ -78,7 +78,11 @@ def merge(
         NotEnoughSpaceError: If the disk has no room for the index.
     """
     if not sources:
-        raise UsageError("no dataset to merge.", "one directory or more.")
+        raise UsageError(
+            "no dataset to merge.",
+            "one directory or more.",
+            "name the datasets to merge, or the folder that holds them.",
+        )
     if out is None and len(sources) > 1:
         raise UsageError(
             f"{len(sources)} directories and no --out.",

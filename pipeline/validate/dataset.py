@@ -113,7 +113,11 @@ def validate_dataset(path: Path | str, sample: int | None = None, seed: int = 0)
 def _sample(root: Path, shards: Sequence[ShardEntry], count: int, seed: int) -> dict[str, list[int]]:
     """Draw `count` rollouts, or all if there are fewer; return their indices within their shards, by file."""
     if count < 1:
-        raise UsageError(f"--sample {count}: not a valid number of rollouts.", "1 or more.")
+        raise UsageError(
+            f"--sample {count}: not a valid number of rollouts.",
+            "1 or more.",
+            "pass a number in this range, or leave --sample out.",
+        )
     places = [(shard.file, place) for shard in shards for place in range(_most_rollouts(root, shard))]
     order = np.random.default_rng(seed).permutation(len(places))[:count]
     chosen: dict[str, list[int]] = {}

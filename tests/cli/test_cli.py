@@ -243,12 +243,14 @@ def test_wrong_settings(run: Run, settings_seen: list[Any], tmp_path: Path) -> N
     assert run("calibrate", "c", "--set", "sg-gs.seed=1") == (
         2,
         "",
-        "--set sg-gs.seed=1: this command runs no stage 'sg-gs'.\nAllowed: calibrate.\n",
+        "--set sg-gs.seed=1: this command runs no stage 'sg-gs'.\nAllowed: calibrate.\n"
+        "Next: begin the key with the name of one of these stages.\n",
     )
     assert run("calibrate", "c", "--set", "seed") == (
         2,
         "",
-        "--set seed: not a setting.\nAllowed: STAGE.KEY=VALUE, for example calibrate.seed=1.\n",
+        "--set seed: not a setting.\nAllowed: STAGE.KEY=VALUE, for example calibrate.seed=1.\n"
+        "Next: write it as in the example.\n",
     )
     assert run("calibrate", "c", "--set", "calibrate.retrys=1") == (
         2,
@@ -291,7 +293,7 @@ def test_a_wrong_shard(run: Run, stage: Callable[..., None], shard: str) -> None
     assert run("synthesize", "model", "--out", "dataset", f"--shard={shard}") == (
         2,
         "",
-        f"--shard {shard}: not a shard.\nAllowed: I/N with 0 <= I < N, for example 3/64.\n",
+        f"--shard {shard}: not a shard.\nAllowed: I/N with 0 <= I < N, for example 3/64.\nNext: pass --shard I/N.\n",
     )
 
 

@@ -134,6 +134,7 @@ def _require_shared_effects(world: World) -> None:
         raise UsageError(
             "group- or episode-specific parameters with --supervise images: images cannot separate them yet.",
             "NAME@group and NAME@episode with --supervise tracks.",
+            "leave @group and @episode out, or add tracks and fit to them.",
         )
 
 

@@ -158,6 +158,7 @@ def _require_short_steps(step_s: float) -> None:
             f"phys-geo.step_s is {1e3 * step_s:g} ms: contacts of {1e3 * CONTACT_TIME.bounds[0]:g} ms, the "
             "shortest in the search, would end within the step in which they begin.",
             f"up to {1e3 * longest:.2g} ms.",
+            "pass a shorter step with --set phys-geo.step_s=SECONDS, or leave it at its default.",
         )
 
 

@@ -58,7 +58,11 @@ def new_effect(file: Path | str, overwrite: bool = False) -> NewEffect:
     """
     path = Path(file)
     if path.suffix != ".py":
-        raise UsageError(f"{path}: an effect is a Python file.", "a name that ends with .py.")
+        raise UsageError(
+            f"{path}: an effect is a Python file.",
+            "a name that ends with .py.",
+            "end the name with .py: cgwm effects new FILE.py.",
+        )
     text = (Path(__file__).parent / "template.py").read_text(encoding="utf-8")
     text = text.replace("from .effect import", "from cgwm.pipeline.physics.effects import")  # from outside the package
     with new_file(path, "effect template", overwrite) as partial:

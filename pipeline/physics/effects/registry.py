@@ -126,7 +126,11 @@ def split_units(spec: str) -> tuple[str, Units | None]:
         return spec, None
     if units in get_args(Units):
         return plain, cast(Units, units)
-    raise UsageError(f"{spec}: '@{units}'.", f"{plain}@group or {plain}@episode, or {plain} alone.")
+    raise UsageError(
+        f"{spec}: '@{units}'.",
+        f"{plain}@group or {plain}@episode, or {plain} alone.",
+        "name the effect in one of these forms; 'cgwm effects list' lists all.",
+    )
 
 
 def aliases(name: str) -> list[str]:
@@ -160,7 +164,9 @@ def _from_file(spec: str, entry: EffectModel | None) -> Any:
     if not classes:
         todo = "write a subclass of Effect, as 'cgwm effects new FILE' does."
         raise UsageError(f"{spec}: the file holds no effect.", todo=todo)
-    raise UsageError(f"{spec}: {found}.", f"{legal}.{did_you_mean(name, classes)}")
+    raise UsageError(
+        f"{spec}: {found}.", f"{legal}.{did_you_mean(name, classes)}", "name one of these classes after the colon."
+    )
 
 
 def _imported(path: Path, data: bytes) -> ModuleType:
@@ -168,7 +174,7 @@ def _imported(path: Path, data: bytes) -> ModuleType:
     name = f"cgwm_effect_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise UsageError(f"{path}: not a Python file.", "a file that ends with .py.")
+        raise UsageError(f"{path}: not a Python file.", "a file that ends with .py.", "end the name with .py.")
     module = importlib.util.module_from_spec(spec)
     before = sys.modules.get(name)
     sys.modules[name] = module  # dataclasses and annotations look their module up there
@@ -207,7 +213,11 @@ def _from_package(spec: str) -> Any:
 
 def _checked(found: Any, spec: str) -> Effect:
     if not (inspect.isclass(found) and issubclass(found, Effect) and found is not Effect):
-        raise UsageError(f"{spec}: not an effect.", "a subclass of cgwm.pipeline.physics.effects.Effect.")
+        raise UsageError(
+            f"{spec}: not an effect.",
+            "a subclass of cgwm.pipeline.physics.effects.Effect.",
+            "derive the class from Effect, as 'cgwm effects new FILE.py' does.",
+        )
     fault = _fault(found)
     if fault:
         raise UsageError(f"{spec}: badly declared: {fault}.", todo="compare it with what 'cgwm effects new' writes.")
@@ -215,7 +225,9 @@ def _checked(found: Any, spec: str) -> Effect:
         return found()
     except Exception as error:  # a user's class may raise anything
         raise UsageError(
-            f"{spec}: cannot be made: {type(error).__name__}: {error}.", "a class that takes no arguments."
+            f"{spec}: cannot be made: {type(error).__name__}: {error}.",
+            "a class that takes no arguments.",
+            "give its constructor no arguments: numbers of an effect are its parameters and constants.",
         ) from error
 
 

@@ -55,6 +55,7 @@ def trust_effects(named: Iterable[str | Path]) -> None:
             raise UsageError(
                 f"--trust-effects {name}: no effect is known by this.",
                 "a Python file, its SHA-256 (64 hexadecimal digits), or a model directory.",
+                "name the file whose effect you have read and trust.",
             )
     os.environ[_VARIABLE] = " ".join(dict.fromkeys((*os.environ.get(_VARIABLE, "").split(), *hashes)))
 

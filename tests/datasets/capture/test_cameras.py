@@ -353,7 +353,8 @@ def test_video_cameras_stand_or_move() -> None:
     with pytest.raises(InputDataError) as caught:
         camera_of(file, "moving", 2, "videos")
     assert str(caught.value) == (
-        "the video camera 'moving' has 2 poses, one a frame; frame 2 was asked for.\nAllowed: 0 to 1."
+        "the video camera 'moving' has 2 poses, one a frame; frame 2 was asked for.\nAllowed: 0 to 1.\n"
+        "Next: remove the frames without a pose, or add these."
     )
     with pytest.raises(InputDataError) as caught:
         camera_of(file, "stil", kind="videos")

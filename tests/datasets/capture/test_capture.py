@@ -359,7 +359,7 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
             "{ left = ",
             "{ lefty = ",
             "C/capture.toml: [video] camera_time_offset_s names the camera 'lefty', which has no directory in "
-            "videos/.\nAllowed: left. Did you mean 'left'?",
+            "videos/.\nAllowed: left. Did you mean 'left'?\nNext: correct the name, or remove the entry.",
         ),
     ],
 )
@@ -415,7 +415,7 @@ def test_mask_of_another_size(root: Path) -> None:
     put(root / "masks" / "walk" / "1.png", label(12, 8))
     assert fault(root) == (
         "C/masks/walk/1.png: the mask has 12x8 px, images/walk/1.jpg has 24x16 px.\n"
-        "Allowed: a mask of its image's size."
+        "Allowed: a mask of its image's size.\nNext: make the mask at the size of the picture."
     )
 
 
@@ -459,7 +459,8 @@ def test_camera_for_a_video_that_is_not_there(root: Path) -> None:
     data["videos"]["lift"] = data["videos"]["left"]
     (root / "cameras.json").write_text(json.dumps(data))
     assert fault(root) == (
-        "C/cameras.json: a camera for the videos 'lift', which are not in videos/.\nAllowed: left. Did you mean 'left'?"
+        "C/cameras.json: a camera for the videos 'lift', which are not in videos/.\nAllowed: left. Did you mean 'left'?\n"
+        "Next: add the videos, or remove the camera from cameras.json."
     )
 
 
