@@ -459,8 +459,8 @@ def test_camera_for_a_video_that_is_not_there(root: Path) -> None:
     data["videos"]["lift"] = data["videos"]["left"]
     (root / "cameras.json").write_text(json.dumps(data))
     assert fault(root) == (
-        "C/cameras.json: a camera for the videos 'lift', which are not in videos/.\nAllowed: left. Did you mean 'left'?\n"
-        "Next: add the videos, or remove the camera from cameras.json."
+        "C/cameras.json: a camera for the videos 'lift', which are not in videos/.\n"
+        "Allowed: left. Did you mean 'left'?\nNext: add the videos, or remove the camera from cameras.json."
     )
 
 
