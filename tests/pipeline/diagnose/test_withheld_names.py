@@ -1,0 +1,174 @@
+"""Names that a diagnosis withholds: no number, no fall of held-out errors, a friction pyramid, a scale that sets in."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose import flight_selection, verdict
+from cgwm.pipeline.diagnose.alternative_laws import FrictionPyramid
+from cgwm.pipeline.diagnose.contact_search import Chosen
+from cgwm.pipeline.diagnose.contact_tests.contact_test import selected
+from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
+from cgwm.pipeline.diagnose.effect_selection import SelectionStep
+from cgwm.pipeline.diagnose.evidence import Evidence
+from cgwm.pipeline.diagnose.flight_selection import FlightSelection
+from cgwm.pipeline.diagnose.lasting_forces import without_lasting
+from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
+from cgwm.pipeline.diagnose.wording import law_warnings
+from cgwm.pipeline.physics.contact_law import Touch
+from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
+from cgwm.pipeline.physics.friction_ellipse import Ellipse
+from cgwm.pipeline.segments.candidates import Candidate, base_parameters
+from cgwm.pipeline.segments.prepare import prepare
+from cgwm.pipeline.segments.segment_fit import refit
+from cgwm.pipeline.trajectories.track_noise import Noise
+from helpers.diagnosis_data import tosses, world_with
+
+F64 = torch.float64
+
+
+def evidence(name: str, numbers: dict[str, tuple[float, float]] | None = None, **more: Any) -> Evidence:
+    size = len(load_effect(name).parameters)
+    test = ScoreTest(
+        statistic=1.0, dof=size, p_value=1.0, estimate=np.ones(size), covariance=np.eye(size), admissible=True
+    )  # fmt: skip
+    candidate = Candidate(name, load_effect(name))
+    return Evidence(
+        candidate=candidate, constants={}, test=test, p_value=1.0, score=1e4, share=0.9, numbers=numbers, **more
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers", "known"),
+    [
+        ("ground_magnet", {"A": (0.3, 0.31)}, False),
+        ("ground_magnet", {"A": (0.3, 0.1)}, True),
+        ("com_offset", {"d_x": (1e-3, 2e-3), "d_y": (5e-3, 1e-3), "d_z": (0.0, 1e-3)}, True),
+        ("com_offset", {"d_x": (1e-3, 2e-3), "d_y": (-9e-4, 1e-3), "d_z": (0.0, 1e-3)}, False),
+        ("stribeck_friction", {"d": (2.0, 0.05)}, False),
+        ("stribeck_friction", {"d": (-2.0, 0.05)}, False),
+        ("stribeck_friction", {"d": (1.9, 0.05)}, True),
+        ("stribeck_friction", None, True),
+    ],
+)
+def test_an_effect_has_a_number_where_it_is_not_within_its_errors_of_zero_nor_at_its_limit(
+    name: str, numbers: dict[str, tuple[float, float]] | None, known: bool
+) -> None:
+    one = evidence(name, numbers)
+    assert one.is_number == known
+    test: Any = SimpleNamespace(
+        leads=lambda best: (), bars=lambda equals, data: (SimpleNamespace(passed=lambda e: True),)
+    )
+    second, data = evidence("rolling_resistance", {"c_r": (1e-3, 1e-4)}), SimpleNamespace()
+    found = selected(test, [one, second], data)  # type: ignore[arg-type]
+    assert [e.name for e in found] == ([name] if known else [])  # none is named in its place
+
+
+def selection(names: list[str], numbers: dict[str, dict[str, tuple[float, float]]]) -> FlightSelection:
+    steps = [SelectionStep((), (evidence(name, numbers.get(name)),), True) for name in names]
+    return FlightSelection(steps, SimpleNamespace(names=names), SimpleNamespace())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("names", "needed", "left"),
+    [
+        (["linear_drag", "ground_magnet"], {"linear_drag"}, ["linear_drag"]),
+        (["ground_magnet"], set[str](), []),
+        (["ground_magnet"], {"ground_magnet"}, ["ground_magnet"]),
+        (["linear_drag", "wind"], {"wind"}, ["linear_drag", "wind"]),  # wind acts through the drag
+    ],
+)
+def test_an_effect_without_which_held_out_flights_are_predicted_as_well_is_not_named(
+    monkeypatch: pytest.MonkeyPatch, names: list[str], needed: set[str], left: list[str]
+) -> None:
+    def without(self: FlightSelection, gone: set[str]) -> FlightSelection:
+        return selection([name for name in self.names if name not in gone], {})
+
+    def loss(flight: Any, world: Any) -> float:
+        return float(len(needed - set(world.names)))
+
+    monkeypatch.setattr(FlightSelection, "without", without)
+    monkeypatch.setattr(flight_selection, "held_out_loss", loss)
+    found = selection(names, {}).without_idle()
+    assert found.names == left and [step.best.name for step in found.steps] == (left or names)
+    zero = selection(
+        names, {"ground_magnet": {"A": (0.0, 1.0)}, "wind": {"w_x": (0.0, 1.0), "w_y": (-0.5, 1.0)}}
+    ).without_idle()
+    assert zero.names == [name for name in left if name in needed and name == "linear_drag"]
+
+
+@pytest.mark.parametrize(("fall", "least", "stays"), [(-1.2, -1.0, False), (-0.5, -1.0, True), (1.5, 2.0, False)])
+def test_an_effect_of_contact_that_raises_held_out_errors_is_not_named(
+    monkeypatch: pytest.MonkeyPatch, fall: float, least: float, stays: bool
+) -> None:
+    one = evidence("viscous_friction")
+    monkeypatch.setattr(verdict, "held_out_fall", lambda segments, world, name: fall)
+    world = replace(world_with("cube"), effects=(ActiveEffect.of(load_effect("viscous_friction"), {"c_v": 0.1}),))
+    contact: Any = verdict.ContactFindings(
+        chosen=[Chosen(one, (one,), "contact")],
+        evidence=[],
+        world=world,
+        segments=SimpleNamespace(),  # type: ignore[arg-type]
+    )
+    found = verdict._without_useless(contact, least)
+    assert bool(found.chosen) == stays and len(found.world.effects) == int(stays)
+
+
+@pytest.mark.parametrize("slip", [(0.3, 0.2), (-1.0, 0.05), (0.0, 2.0), (-0.4, -0.4)])
+def test_a_friction_pyramid_brakes_along_each_axis_by_itself(slip: tuple[float, float]) -> None:
+    velocity = torch.tensor([[[*slip, 0.0]]], dtype=F64)
+    one = torch.ones(1, 1, dtype=F64)
+    touch = Touch(
+        ground=True,
+        position=torch.zeros(1, 1, 3, dtype=F64),
+        normal=torch.tensor([[[0.0, 0.0, 1.0]]], dtype=F64),
+        gap=0 * one,
+        velocity=velocity,
+        spin_rad_s=torch.zeros(1, 3, dtype=F64),
+        step_s=1e-3 * one,
+        friction=0.4 * one,
+        contact_time_s=1e-3 * one,
+        damping_ratio=one,
+    )
+    changed = FrictionPyramid().contact({}, touch)
+    assert changed.anisotropy is not None
+    ellipse = Ellipse.of(changed.friction, changed.anisotropy)
+    push = ellipse.nearest(-1e6 * velocity[..., :2], one)[0, 0]  # what dissipates the most
+    expected = -0.4 * torch.sign(velocity[0, 0, :2])
+    across = torch.tensor(slip).abs() > 0.02 * max(map(abs, slip))  # along an axis nothing pushes sideways
+    torch.testing.assert_close(push[across], expected[across], rtol=0.03, atol=0.0)
+    assert bool((push[~across].abs() < 0.1).all())
+
+
+def test_friction_by_direction_is_not_named_where_a_pyramid_explains_slides_as_well() -> None:
+    data: Any = SimpleNamespace(flown=False, explained=True, sliding=None)
+    share = THRESHOLDS.sliding.pyramid_share
+    counts = [
+        len(SlidingTest().bars([evidence("anisotropic_friction", pyramid_share=s)], data)) for s in (0.5, share, 1.1)
+    ]
+    assert counts == [2, 2, 0]
+    findings: Any = SimpleNamespace(as_good=(), as_pyramid=("anisotropic_friction",))
+    (said,) = law_warnings(findings)
+    assert "pyramid" in said and "Next, " in said and "slides along x, along y and between" in said
+
+
+def test_a_gravity_that_sets_in_is_no_scale_of_lengths() -> None:
+    noise, size = Noise(3e-4, 1e-3), 0.04
+
+    def sinking(track: Track) -> Track:
+        late = np.clip(track.time_s - 0.25, 0.0, None)
+        return replace(track, position_m=track.position_m + 0.5 * 4 * size * -9.81 * late[:, None] ** 2 * np.eye(3)[2])
+
+    world = world_with("ball", ground=False)
+    plain = tosses(world, 3, 4, 0.5, 148.0, noise)
+    late = [(name, {body: sinking(track) for body, track in tracks.items()}) for name, tracks in plain]
+    prepared = prepare(world, late, noise)
+    assert prepared.flight is not None
+    named = replace(world, effects=(ActiveEffect.of(load_effect("length_scale"), {}, world.gravity[0, :1]),))
+    fitted = refit([prepared.flight], named, base_parameters(named, "flight"))
+    assert without_lasting(fitted.segments[0], fitted.world, ["length_scale"], 1.0) == {"length_scale"}
