@@ -24,7 +24,7 @@ from .flight_omnibus import is_significant
 from .remaining import bad_ones, misfits_of
 from .thresholds import THRESHOLDS
 
-LIMITS, CONTACT = THRESHOLDS.verdict, THRESHOLDS.segments
+LIMITS = THRESHOLDS.verdict
 
 VerdictName = Literal["missing_effect", "none_missing", "unexplained", "not_separable", "law_inexact"]
 
@@ -91,7 +91,8 @@ def find(
     note("diagnose: held-out episodes")
     errors = _errors(contact, flown)
     # what flights show may be what contact imitates
-    contact = _without_useless(contact, CONTACT.confirmed if flown.remains or flown.own else -CONTACT.worse_t)
+    limits = THRESHOLDS.segments
+    contact = _without_useless(contact, limits.confirmed if flown.remains or flown.own else -limits.worse_t)
     in_contact = any(one.where == "contact" for one in contact.chosen)
     misfits = () if contact.segments is None or in_contact else misfits_of(contact.segments)
     verdict = _verdict(contact.chosen, flown)

@@ -45,6 +45,8 @@ STATED = [
 TABLE = {f"{group}.{one.name}": one for group, some in thresholds_page.groups().items() for one in some}
 """Thresholds of a diagnosis, by group.field."""
 NUMERICS = {
+    "alternative_laws.FLATTEST": "keeps an ellipse from degenerating",
+    "evidence.NEARLY": "rounding of a value at its bound",
     "session_scales.LEAST_SPREAD": "keeps a matrix solvable",
     "contact_information.LEAST_STEP_S": "resolution of simulated motions",
     "contact_information.WEAK_SHARE": "keeps a matrix solvable",
@@ -189,6 +191,10 @@ SEGMENT_NUMERICS = {
 TRACK_NUMERICS = {
     "end of a descent, or its grid": (
         "correlated_noise.REMEMBERED",
+        "frame_times.TRIED_S",
+        "frame_times.FACTORS",
+        "frame_times.BINS",
+        "frame_times.FAR",
         "correlated_noise.FAR",
         "correlated_noise.ROBUST_SCALE",
         "correlated_noise.MOST_CORRELATED",
@@ -212,6 +218,7 @@ TRACK_NUMERICS = {
         "correlated_noise.LARGEST_TURN",
         "correlated_noise.LEAST",
         "flight_noise.WINDOW",
+        "frame_times.CUBIC_FRAMES, DEGREE",
         "flight_noise.DEGREE",
         "flight_noise.SLOW_DEGREE",
         "track_noise.WINDOW",
