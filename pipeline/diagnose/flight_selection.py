@@ -66,13 +66,10 @@ class FlightSelection(NamedTuple):
         found = self
         for step in reversed(self.steps):
             name = step.best.name
-            if (
-                name in found.names
-                and not _carrying(found, name)
-                and (not step.best.is_number or _adds_nothing(found, name))
-            ):
+            idle = name in found.names and (not step.best.is_number or _adds_nothing(found, name))
+            if idle and not _carrying(found, name):
                 found = found.without({name})
-        return found if found.steps else found._replace(steps=[replace(self.steps[0], flagged=False)])
+        return found if found.steps or not self.steps else found._replace(steps=[replace(self.steps[0], flagged=False)])
 
     def bic(self, scatter: float) -> float:
         """Return BIC, up to a constant of the flights; infinite without flight.

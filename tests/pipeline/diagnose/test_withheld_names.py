@@ -78,6 +78,7 @@ def selection(names: list[str], numbers: dict[str, dict[str, tuple[float, float]
     ("names", "needed", "left"),
     [
         (["linear_drag", "ground_magnet"], {"linear_drag"}, ["linear_drag"]),
+        ([], set[str](), []),
         (["ground_magnet"], set[str](), []),
         (["ground_magnet"], {"ground_magnet"}, ["ground_magnet"]),
         (["linear_drag", "wind"], {"wind"}, ["linear_drag", "wind"]),  # wind acts through the drag
