@@ -339,7 +339,7 @@ def main() -> int:
     """Measure what is missing of the cases, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     stages = dict.fromkeys((*STAGES, *REAL_STAGES))
-    parser.add_argument("--stage", choices=stages, default="development", help="report1 to report6: of real-like alone")
+    parser.add_argument("--stage", choices=stages, default="development", help="report1 to report7: of real-like alone")
     parser.add_argument("--list", choices=LISTS, default="all", help="which cases")
     parser.add_argument("--nulls", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=None, help="seeds of each effect, pair and unknown; of each row")
