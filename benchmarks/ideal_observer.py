@@ -33,7 +33,7 @@ from cgwm.datasets.models.model import read_model
 from cgwm.datasets.synthetic.hidden_effects import EFFECTS
 from cgwm.pipeline.diagnose.stage import library_of, prepared_world
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.segments.candidates import acts_in, admissible, variants_of
+from cgwm.pipeline.segments.candidates import acts_in, admissible, base_parameters, variants_of, with_variants
 from cgwm.pipeline.segments.linearization import derivatives
 from cgwm.pipeline.segments.prepare import whole_flights
 from cgwm.pipeline.segments.segment_states import fit_states
@@ -79,14 +79,17 @@ def seen(model: Path, capture: Path, truth: dict[str, Any]) -> Seen:
     variants = [v for v in variants_of(kept, world.gravity[0, :1]) if acts_in(v, "flight")]
     every = whole_flights(prepared.flight.items) if prepared.flight is not None else []
     items = [item for item in every if item.last - item.first + 1 >= LEAST_FRAMES]
-    fitted = fit_states(prepared.segments("flight", world, items))
-    plain = Segments.of("flight", world, prepared.observations, items, prepared.noise, WHITE)
-    plain = plain.with_state(fitted.observations.state)
-    parameters, _, jacobian = derivatives(plain, world, variants)
-    slopes = torch.nan_to_num(jacobian).numpy().astype(np.float64)
+    parameters = [*base_parameters(world, "flight"), *with_variants(world, variants, "flight")[1]]
     owner = {name: kept[v.place].effect.name for v in variants for name in v.parameters}
     names = [owner.get(p.name, p.name) for p in parameters]
     numbers = [p.name.partition(".")[2] for p in parameters]
+    width = np.array([p.prior[1] for p in parameters])
+    if not items:  # drops and slides without a flight that is long enough show nothing
+        return Seen(names, numbers, width, np.zeros((len(parameters), len(parameters))))
+    fitted = fit_states(prepared.segments("flight", world, items))
+    plain = Segments.of("flight", world, prepared.observations, items, prepared.noise, WHITE)
+    plain = plain.with_state(fitted.observations.state)
+    slopes = torch.nan_to_num(derivatives(plain, world, variants)[2]).numpy().astype(np.float64)
     errors, episodes = _errors(truth), truth["episodes"]
     tilts = [names.index("frame_tilt") + k for k in range(2)] if errors.tilt_rad else []
     scales = [names.index("length_scale")] if errors.scale else []
@@ -112,7 +115,7 @@ def seen(model: Path, capture: Path, truth: dict[str, Any]) -> Seen:
     prior = [spread[key[0]] ** -2.0 for key, (_, columns) in places.items() for _ in columns]
     mixed = total[:size, size:]
     information = total[:size, :size] - mixed @ np.linalg.solve(total[size:, size:] + np.diag(prior), mixed.T)
-    return Seen(names, numbers, np.array([p.prior[1] for p in parameters]), information)
+    return Seen(names, numbers, width, information)
 
 
 def _errors(truth: dict[str, Any]) -> Errors:
