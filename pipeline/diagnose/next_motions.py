@@ -68,6 +68,8 @@ class Question:
         for channel in self.channels:
             information = _each(channel, chosen, more, times)
             for place, name in enumerate(self.names):
+                if channel.name == "sliding" and name in THRESHOLDS.sliding.as_friction:
+                    continue  # slides follow it by friction
                 own = _shown(channel, information, self.sizes[place], place)
                 full, rest = _needed(channel, self.variants[place])
                 # the others have to show it, too
@@ -100,9 +102,7 @@ def next_motions(prepared: Prepared, findings: Findings, candidates: Sequence[Ca
     if rivals is None or not _can_be_made(world, prepared):
         return None
     kept, _ = admissible(world, candidates, prepared.has_orientation)
-    # slides follow a pull at the ground by friction
-    unseen = THRESHOLDS.sliding.as_friction
-    acting = [c for c in kept if c.effect.phase == "contact" and c.effect.name not in unseen]
+    acting = [c for c in kept if c.effect.phase == "contact"]
     if not acting:
         return None
     motions = hand_motions(is_round(world.bodies[world.free[0]]))

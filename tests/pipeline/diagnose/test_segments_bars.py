@@ -1,4 +1,4 @@
-"""What contact segments have to show before an effect is named from them: they confirm what other tests saw."""
+"""What contact segments have to show before an effect is named: with slides that show it, and alone."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -29,25 +29,33 @@ def evidence(name: str, score: float = 300.0, share: float = 0.9) -> Evidence:
     )
 
 
-def bars(one: Evidence, sliding: tuple[str, ...] = ()) -> list[float]:
-    data: Any = SimpleNamespace(earlier={"sliding": [evidence(n) for n in sliding]})
+def bars(one: Evidence, sliding: tuple[str, ...] = (), flown: bool = False, explained: bool = True) -> list[float]:
+    shown = [evidence(name, LIMITS.shown_score + 1) for name in sliding]
+    data: Any = SimpleNamespace(earlier={"sliding": shown}, flown=flown, explained=explained)
     return [bar.score for bar in SegmentsTest().bars([one], data)]
 
 
-@pytest.mark.parametrize("name", ["velocity_restitution", "ground_magnet", "adhesion", "viscous_friction"])
-def test_segments_alone_name_nothing(name: str) -> None:
+@pytest.mark.parametrize("name", ["velocity_restitution", "ground_magnet", "rolling_resistance", "friction_patch"])
+def test_segments_alone_do_not_name_what_laws_of_contact_imitate(name: str) -> None:
     assert bars(evidence(name, 1e6)) == []
     assert bars(evidence(name, 1e6), sliding=("stribeck_friction", name)) == []
 
 
-def test_an_effect_that_ranks_first_among_slides_is_confirmed() -> None:
-    assert bars(evidence("viscous_friction"), sliding=("viscous_friction",)) == [LIMITS.agreed_score]
-    assert bars(evidence("anisotropic_friction"), sliding=("anisotropic_friction",)) == []  # two numbers fit two slides
+@pytest.mark.parametrize("name", ["viscous_friction", "anisotropic_friction"])
+def test_an_effect_that_ranks_first_among_slides_needs_less(name: str) -> None:
+    alone = dict(LIMITS.alone)[name]
+    assert bars(evidence(name)) == [alone]
+    assert bars(evidence(name), sliding=(name,)) == [LIMITS.agreed_score, alone]
+    assert LIMITS.agreed_score < alone
+    # nine numbers fit any law
+    assert bars(evidence("friction_patch"), sliding=("friction_patch",)) == []
 
 
-def test_a_torque_about_the_normal_needs_no_slides() -> None:
+def test_a_torque_about_the_normal_needs_no_slides_and_no_clear_flight() -> None:
     """No law of contact has one at a point, whatever its restitution and friction are."""
-    assert bars(evidence("torsional_friction")) == [LIMITS.alone_score]
+    alone = [dict(LIMITS.alone)["torsional_friction"]]
+    assert bars(evidence("torsional_friction"), flown=True, explained=False) == alone
+    assert bars(evidence("viscous_friction"), flown=True) == bars(evidence("viscous_friction"), explained=False) == []
     assert bars(replace(evidence("torsional_friction"), repetition=Repetition(3.0, 0.2, 0.3))) == []
 
 
