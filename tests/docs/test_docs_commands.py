@@ -289,7 +289,13 @@ def test_there_are_blocks_to_run() -> None:
     assert {block.word for block in RUN} <= FOLDERS
 
 
-@pytest.mark.parametrize("block", [block for block in RUN if block.language == "sh"], ids=lambda block: block.place)
+def shell_block(block: Block) -> object:
+    """Return a block of commands as a parameter; each format of an export has its tests in the suite."""
+    marks = pytest.mark.evidence if block.place.startswith("docs/exports.md") else ()
+    return pytest.param(block, id=block.place, marks=marks)
+
+
+@pytest.mark.parametrize("block", [shell_block(block) for block in RUN if block.language == "sh"])
 def test_the_commands_run(
     block: Block, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -92,8 +92,13 @@ CHANGES: dict[str, tuple[Change, str]] = {
     "the source of an effect": (append("mine.py", "# more\n"), "mine.py:MyEffect"),
 }
 
+LATE = ("the seed", "the stage", "the manifest", "a photo")
+"""Changes whose like is tested in the suite: another setting, another file."""
 
-@pytest.mark.parametrize("change", CHANGES)
+
+@pytest.mark.parametrize(
+    "change", [pytest.param(name, marks=pytest.mark.evidence if name in LATE else ()) for name in CHANGES]
+)
 def test_a_finished_model_of_others_is_refused_and_named(place: Path, change: str) -> None:
     if change == "a photo":
         (place / "capture" / "images").mkdir(exist_ok=True)

@@ -591,7 +591,9 @@ def test_the_wrong_kind_is_named(dataset: Path, model: Path, tmp_path: Path, for
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("format_", ["ply", "glb", "bop", "nerfstudio"])
+@pytest.mark.parametrize(
+    "format_", ["ply", *(pytest.param(f, marks=pytest.mark.evidence) for f in ("glb", "nerfstudio")), "bop"]
+)
 def test_what_exists_stays(short: Path, model: Path, tmp_path: Path, format_: ExportFormat) -> None:
     out = tmp_path / ("out.glb" if format_ == "glb" else "out")
     thing = short if format_ in DATASET_FORMATS else model

@@ -153,6 +153,8 @@ def test_servos_are_given_by_joint_name_and_need_limits(tmp_path: Path) -> None:
         link_spheres(found, 5)
 
 
+# In the suite: spheres inside shapes are tested in test_collision.py, those of links in the MJCF file below.
+@pytest.mark.evidence
 def test_equal_links_get_equal_spheres_inside_their_geometry(tmp_path: Path) -> None:
     found = read_articulation(written(tmp_path, ARM))
     spheres = link_spheres(found, 24)

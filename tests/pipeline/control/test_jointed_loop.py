@@ -100,7 +100,7 @@ def test_passive_joints_have_no_targets_and_driven_roots_are_refused() -> None:
 
 
 @pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU")
-@pytest.mark.parametrize("lanes", [1, 4])
+@pytest.mark.parametrize("lanes", [pytest.param(1, marks=pytest.mark.evidence), 4])
 def test_joints_go_on_where_they_ended_and_a_reset_begins_anew(lanes: int) -> None:
     """The arm falls onto its lower limit, whose impulse warm-starts the next interval."""
     world = World.from_model(served())

@@ -174,6 +174,8 @@ def test_of_rivals_the_one_that_acts_alone_comes_first() -> None:
     assert _with_unproven([wind], [wind, tilt], np.arange(3)) == [tilt, wind]
 
 
+# In the suite: a tilt of each episode's own is found in the tests below and in test_diagnosis.py.
+@pytest.mark.evidence
 def test_a_tilt_that_differs_from_episode_to_episode_is_named_as_such() -> None:
     named = found({}, tilt_m_s2=0.15, seed=3)
     assert [one.evidence.candidate.spec for one in named.chosen] == ["gravity_tilt@episode"]

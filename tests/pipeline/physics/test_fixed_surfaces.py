@@ -108,7 +108,7 @@ def test_degenerate_triangles_are_refused() -> None:
         fixed.mesh_surface([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2)])
 
 
-@pytest.mark.parametrize("kind", ["planes", "mesh"])
+@pytest.mark.parametrize("kind", [pytest.param("planes", marks=pytest.mark.evidence), "mesh"])
 def test_a_ball_rolls_down_a_groove_at_the_analytic_acceleration(kind: str) -> None:
     """Rolling about the line between two contacts at r / sqrt(2): a = g sin / (1 + 2/5 r^2 / (r^2 / 2))."""
     slope, radius = 10.0, 0.02

@@ -38,7 +38,7 @@ def silhouettes(count, center=CENTER):
 
 @pytest.fixture(scope="module")
 def hull():
-    return carve(silhouettes(40), None)
+    return carve(silhouettes(28), None)
 
 
 def test_the_surface_is_where_it_should_be(hull):
