@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from cgwm.pipeline.geometry.directions import fibonacci_directions
-from cgwm.pipeline.sg_gs.visual_hull import Silhouette, carve
+from cgwm.pipeline.sg_gs.visual_hull import Silhouette, _farthest, carve
 from cgwm.schemas import Ground, InputDataError
 
 HALF = np.array([0.05, 0.035, 0.03])
@@ -65,6 +65,12 @@ def test_the_ground_cuts_what_no_view_sees(hull):
     cut = carve(silhouettes(12), ground)
     assert cut.surface[:, 2].min() == pytest.approx(0.05, abs=1e-9)
     assert hull.surface[:, 2].min() < 0.035
+
+
+def test_points_in_blocks_are_as_far_as_all_at_once():
+    rng = np.random.default_rng(0)
+    points, directions = rng.integers(-9, 10, (2500, 3)).astype(float), fibonacci_directions(50)
+    np.testing.assert_array_equal(_farthest(points, directions), (points @ directions.T).argmax(0))
 
 
 def test_masks_that_do_not_fit_are_refused():
