@@ -52,15 +52,17 @@ def pytest_collection_finish() -> None:
 
 
 LONGEST = (
-    "test_fused.py", "test_calibrate.py", "test_separation.py", "test_fuzz.py", "test_diagnosis.py", "test_sg_gs.py",
-    "test_next_throw.py", "test_export.py", "test_compare.py", "test_validate.py", "test_shards.py",
-    "test_visual_collision.py", "test_diagnosis_glides.py", "test_scenes.py", "test_image_fit.py", "test_photos.py",
-    "test_diagnosis_impacts.py", "test_diagnosis_lasting.py", "test_effects.py", "test_rollout_batches.py",
-    "test_slow_errors.py", "test_video_input.py", "test_architecture.py", "test_trust.py", "test_phys_images.py",
-    "test_view.py", "test_checkpoint.py", "test_mystery.py", "test_pose_histories.py", "test_honest_supervision.py",
-    "test_fit_effects.py", "test_releases.py", "test_ellipse.py", "test_workers.py",
+    "test_fused.py", "test_diagnosis.py", "test_calibrate.py", "test_shards.py", "test_export.py", "test_compare.py",
+    "test_fuzz.py", "test_effects.py", "test_validate.py", "test_scenes.py", "test_fused_surfaces.py",
+    "test_slow_errors.py", "test_robot_exports.py", "test_physics.py", "test_view.py", "test_laws.py",
+    "test_synthesize.py", "test_mystery.py", "test_sg_gs.py", "test_fused_chains.py", "test_interrupt.py",
+    "test_chains.py", "test_trust.py", "test_phys_images.py", "test_diagnosis_glides.py", "test_collision.py",
+    "test_separation.py", "test_fit_effects.py", "test_video_input.py", "test_articulation.py", "test_published.py",
+    "test_preview.py", "test_outputs.py", "test_resume.py", "test_visual_collision.py", "test_checkpoint.py",
+    "test_dataset_structure.py", "test_estimation.py", "test_checks.py", "test_architecture.py",
+    "test_diagnosis_impacts.py", "test_workers.py", "test_shooting.py",
 )  # fmt: skip
-"""Files that take 5 s or more of one core, the longest first."""
+"""Files that take 4 s or more of one core, the longest first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
