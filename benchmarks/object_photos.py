@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 WIDTH, HEIGHT = 640, 480
 _BLUR_PX, _NOISE, _JPEG = 0.6, 2.0, 92
 _CARDS, _SIDE = 7, 512
+_MIDDLES = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
+"""From places in a photo, whose first pixel has its middle at 0.5, to OpenCV's, where that is 0."""
 _BACKDROP = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "clutter": (0.0, 0.0, 0.0)}
 
 
@@ -131,11 +133,11 @@ def _table(session: Session, mesh: Mesh, place: Array) -> NDArray[np.float32]:
     image = np.full((HEIGHT, WIDTH, 3), 0.35, np.float32)
     for k in [0, *(1 + np.argsort(far[1:]))]:
         corner, u, v = cards[k]
-        # pixel (a, b) of the pattern lies at corner + (a u + b v) / side
-        plane = np.column_stack([u / _SIDE, v / _SIDE, corner])
+        # the middle of pixel (a, b) of the pattern lies at corner + ((a + 0.5) u + (b + 0.5) v) / side
+        plane = np.column_stack([u / _SIDE, v / _SIDE, corner + 0.5 * (u + v) / _SIDE])
         rows = pose[:3, :3] @ plane
         rows[:, 2] += pose[:3, 3]
-        homography = camera_matrix(session) @ rows
+        homography = _MIDDLES @ camera_matrix(session) @ rows
         cover = cv2.warpPerspective(np.ones((_SIDE, _SIDE), np.float32), homography, (WIDTH, HEIGHT))
         drawn = cv2.warpPerspective(patterns[k], homography, (WIDTH, HEIGHT), flags=cv2.INTER_AREA)
         image = np.where(cover[..., None] > 0.5, drawn, image)
