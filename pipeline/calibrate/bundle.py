@@ -133,6 +133,34 @@ def linearized(
     )
 
 
+def told_by_points(
+    model: SfmModel, models: Map[str, str], reduced: ReducedEquations, direction: Array, loss_px: float
+) -> Array:
+    """Return how much the observations of each point tell of a change of poses and intrinsics, shape (point,).
+
+    They are the parts of d' N d, N the reduced matrix and d the change.
+
+    Args:
+        model: The model.
+        models: As in `linearized`.
+        reduced: Its reduced equations, with principal points.
+        direction: The change, shape (n,).
+        loss_px: As in `linearized`.
+    """
+    moves = (reduced.whole.coupling.T @ direction).reshape(-1, 3)
+    told = -np.einsum("pi,pi->p", moves, np.asarray(reduced.inverse @ moves.ravel()).reshape(-1, 3))
+    for k, image in enumerate(model.T_cam_world):
+        camera = model.image_camera[image]
+        pose, _, lens, residual = _jacobians(model, image, models.get(camera))
+        change = pose @ direction[POSE * k : POSE * (k + 1)]
+        if camera in models:
+            at, free = reduced.whole.columns[camera], lens.shape[2]
+            change += lens @ direction[at : at + free] + direction[at + free : at + free + PRINCIPAL]
+        weight = 1.0 / (1.0 + (np.linalg.norm(residual, axis=1) / loss_px) ** 2)
+        np.add.at(told, model.observations[image][1], weight * (change**2).sum(1))
+    return told
+
+
 def errors_px(model: SfmModel, image: str) -> Array:
     """Return the reprojection errors of an image's observations [px], shape (observation,)."""
     pixels, seen = model.observations[image]

@@ -8,12 +8,15 @@ from collections.abc import Mapping as Map
 import numpy as np
 
 from .bundle import POSE
-from .pose_posterior import posterior
+from .pose_posterior import Posterior, posterior, without_most_telling
 from .reconstruction import Array, SfmModel
 from .turntable_motion import TurntableMotion
 
 UNCERTAIN_CENTER = 0.0012
 """Standard deviation of an optical centre, as a fraction of the extent of all, above which a warning is given."""
+
+_TIMES_DOUBTED = 2
+"""Directions, in turn, whose most telling points are left out."""
 
 
 def center_stds(
@@ -32,7 +35,7 @@ def center_stds(
         Standard deviation by image, as a fraction of the diagonal of the box around all centres; infinite where the
         observations do not determine the cameras.
     """
-    return pose_stds(model, models, with_exif, motion)[0]
+    return _stds(model, posterior(model, models, with_exif, motion))[0]
 
 
 def pose_stds(
@@ -40,14 +43,22 @@ def pose_stds(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return what `center_stds` does, and the standard deviation of each camera's rotation [rad] after that alignment.
 
+    The points that tell most of what is least certain are left out for it, `pose_posterior.DOUBTED` of all observations
+    at a time: where few points tie the cameras, all of these may be wrong.
+
     Args:
         model: As in `center_stds`.
         models: As there.
         with_exif: As there.
         motion: As there.
     """
-    variances = posterior(model, models, with_exif, motion).variances
-    sums = variances[: POSE * len(model.T_cam_world)].reshape(-1, 2, 3).sum(2)
+    for _ in range(_TIMES_DOUBTED):
+        model = without_most_telling(model, models, with_exif, motion)
+    return _stds(model, posterior(model, models, with_exif, motion))
+
+
+def _stds(model: SfmModel, found: Posterior) -> tuple[dict[str, float], dict[str, float]]:
+    sums = found.variances[: POSE * len(model.T_cam_world)].reshape(-1, 2, 3).sum(2)
     extent = float(np.linalg.norm(np.ptp(model.centers(), axis=0)))
     return _by_image(model, sums[:, 0] / extent**2), _by_image(model, sums[:, 1])
 

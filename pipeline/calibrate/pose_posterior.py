@@ -9,6 +9,8 @@ that after the best similarity alignment of all centres.
 The factor f is there since observations share errors. Neighbouring patches hold the same pixels, a feature's place
 shifts with the direction of view, and what all observations of a place have in common is fitted by poses and points: no
 residual shows it, and no scatter between parts of the points does.
+
+What a camera model leaves out is not known to be zero: where it has no distortion, k1 has a prior.
 """
 
 from __future__ import annotations
@@ -19,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .bundle import POSE, PRINCIPAL, all_errors_px, linearized
-from .camera_models import LENS_PARAMETERS
+from .bundle import POSE, PRINCIPAL, ReducedEquations, all_errors_px, linearized, told_by_points
+from .camera_models import LADDER, LENS_PARAMETERS
 from .focal_prior import EXIF_STD
 from .mapping import LEAST_NOISE_PX, LOSS_SCALE, noise_px
 from .reconstruction import Array, SfmModel
@@ -31,9 +33,17 @@ SHARED_VARIANCE = 4.0
 """Variance of the errors of poses, in units of that of independent errors: calibrated on photos of scanned objects with
 known cameras ([Thresholds](../../docs/thresholds.md))."""
 
-PRINCIPAL_STD = 0.003
+PRINCIPAL_STD = 0.005
 """Standard deviation of a coordinate of the principal point about the middle, as a fraction of the picture's diagonal:
 a lens is centred on a sensor to some tenths of a millimetre."""
+
+DISTORTION_STD = 0.1
+"""Standard deviation of k1 about zero where the observations ask for no distortion: a lens has some."""
+
+DOUBTED = 0.005
+"""Share of all observations that may be wrong, wherever they do most harm (twice, `center_uncertainty`)."""
+DOUBTED_OF_PHOTO = 0.25
+"""Largest share of a photo's observations among them, so that a photo with few matches keeps most of these."""
 
 _STILL = 0.3
 """Standard deviations by which a principal point is off before it is moved."""
@@ -41,6 +51,8 @@ _SIMILARITY = 7
 """Numbers of a similarity transform."""
 _FLOOR = 1e-9
 """Least information of a number that scales it, relative to the largest."""
+_UNDETERMINED = 1e-12
+"""Least information of a direction, relative to that of the numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +69,25 @@ class Posterior:
     """First column of its principal point."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Solution:
+    """The posterior's equations on the directions that are no similarity of the centres, solved."""
+
+    models: dict[str, str]
+    reduced: ReducedEquations
+    basis: Array
+    inverse: Array
+    pull: Array
+    principal: dict[str, int]
+    loss_px: float
+
+    def weakest(self, images: int) -> Array:
+        """Return the direction in which the centres are least certain, shape (n,)."""
+        centers = self.basis[(POSE * np.arange(images)[:, None] + np.arange(3)).ravel()]
+        worst = np.linalg.eigh(centers @ self.inverse @ centers.T)[1][:, -1]
+        return self.basis @ (self.inverse @ (centers.T @ worst))
+
+
 def posterior(
     model: SfmModel, models: Map[str, str], with_exif: Collection[str] = (), motion: TurntableMotion | None = None
 ) -> Posterior:
@@ -68,10 +99,55 @@ def posterior(
         with_exif: Those cameras among them whose focal length EXIF data have told, too.
         motion: The turntable that the poses were constrained to, whose axis is z; the numbers are then those of it.
     """
+    found = _solved(model, models, with_exif, motion)
+    return Posterior(
+        step=found.basis @ (found.inverse @ found.pull),
+        variances=np.einsum("ij,jk,ik->i", found.basis, found.inverse, found.basis, optimize=True),
+        focal_columns=found.reduced.whole.columns,
+        principal_columns=found.principal,
+    )
+
+
+def without_most_telling(
+    model: SfmModel, models: Map[str, str], with_exif: Collection[str], motion: TurntableMotion | None
+) -> SfmModel:
+    """Return a model without the points that tell most of the direction in which its centres are least certain.
+
+    Where two sides of an object share little, some twenty points tell how they lie to each other. Most of them may be
+    wrong alike, as on an outline that glides over the surface, and then cameras bend until these agree with all others.
+
+    Args:
+        model: As in `posterior`; as are the others.
+        models: As there.
+        with_exif: As there.
+        motion: As there.
+    """
+    found, images = _solved(model, models, with_exif, motion), list(model.T_cam_world)
+    told = told_by_points(model, found.models, found.reduced, found.weakest(len(images)), found.loss_px)
+    photo = np.repeat(np.arange(len(images)), [len(model.observations[image][1]) for image in images])
+    point = np.concatenate([model.observations[image][1] for image in images])
+    seen = np.split(photo[np.argsort(point, kind="stable")], np.cumsum(np.bincount(point, minlength=len(told)))[:-1])
+    room, left = DOUBTED_OF_PHOTO * np.bincount(photo, minlength=len(images)), DOUBTED * len(point)
+    kept = np.ones(len(told), bool)
+    for index in np.argsort(-told, kind="stable"):
+        left -= len(seen[index])
+        if left < 0:
+            break
+        if (room[seen[index]] >= 1.0).all():
+            room[seen[index]] -= 1.0
+            kept[index] = False
+    return model.with_points(kept)
+
+
+def _solved(
+    model: SfmModel, models: Map[str, str], with_exif: Collection[str], motion: TurntableMotion | None
+) -> _Solution:
     lengths = all_errors_px(model)
-    equations = linearized(model, models, LOSS_SCALE * noise_px(lengths), principal=True)
-    reduced, focal = equations.reduced(), equations.columns
-    principal = {camera: column + LENS_PARAMETERS[models[camera]] for camera, column in focal.items()}
+    lenses = {camera: max(name, "SIMPLE_RADIAL", key=LADDER.index) for camera, name in models.items()}
+    loss_px = LOSS_SCALE * noise_px(lengths)
+    reduced = linearized(model, lenses, loss_px, principal=True).reduced()
+    focal = reduced.whole.columns
+    principal = {camera: column + LENS_PARAMETERS[lenses[camera]] for camera, column in focal.items()}
     size = len(reduced.matrix)
     design = np.eye(size) if motion is None else _design(model, motion, size)
     weights = _weights(lengths)
@@ -82,21 +158,27 @@ def posterior(
         offset, std = _about_the_middle(model, camera)
         information[column : column + PRINCIPAL, column : column + PRINCIPAL] += np.eye(PRINCIPAL) / std**2
         pull[column : column + PRINCIPAL] -= offset / std**2
+        if lenses[camera] != models[camera]:
+            information[column - 1, column - 1] += 1.0 / DISTORTION_STD**2
     for camera in with_exif:
         known = 1.0 / (EXIF_STD * model.cameras[camera].focal_px) ** 2
         information[focal[camera], focal[camera]] += known  # its mean is in the focal length already
     basis = _basis(design, information, model.centers())
-    try:
-        inverse = np.linalg.inv(basis.T @ information @ basis)
-    except np.linalg.LinAlgError:
-        unknown = np.full(size, np.inf)
-        return Posterior(step=np.zeros(size), variances=unknown, focal_columns=focal, principal_columns=principal)
-    return Posterior(
-        step=basis @ (inverse @ (basis.T @ pull)),
-        variances=np.einsum("ij,jk,ik->i", basis, inverse, basis, optimize=True),
-        focal_columns=focal,
-        principal_columns=principal,
+    return _Solution(
+        models=lenses,
+        reduced=reduced,
+        basis=basis,
+        inverse=_inverse(basis.T @ information @ basis),
+        pull=basis.T @ pull,
+        principal=principal,
+        loss_px=loss_px,
     )
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse of a matrix whose diagonal is one; directions that nothing determines get a large variance."""
+    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+    return (vectors / np.maximum(values, _UNDETERMINED)) @ vectors.T
 
 
 def principal_points(model: SfmModel, models: Map[str, str]) -> dict[str, Array]:

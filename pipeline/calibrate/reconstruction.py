@@ -144,6 +144,14 @@ class SfmModel:
             observations={names[image]: seen for image, seen in self.observations.items()},
         )
 
+    def with_points(self, kept: NDArray[np.bool_]) -> SfmModel:
+        """Return the model with some of its points (point,), and their observations."""
+        index, observations = np.cumsum(kept) - 1, {}
+        for image, (pixels, seen) in self.observations.items():
+            own = kept[seen]
+            observations[image] = (pixels[own], index[seen[own]])
+        return replace(self, points=self.points[kept], colors=self.colors[kept], observations=observations)
+
     def transformed(self, similarity: Similarity) -> SfmModel:
         """Return the model in another world frame and unit."""
         return replace(

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cgwm.pipeline.calibrate import attempts, pose_posterior
+from cgwm.pipeline.calibrate.camera_models import LADDER
 from cgwm.pipeline.calibrate.center_uncertainty import center_stds, pose_stds
 from cgwm.pipeline.calibrate.metric_scale import umeyama
 from cgwm.pipeline.calibrate.pose_posterior import posterior, principal_points
@@ -157,6 +158,45 @@ def test_a_photo_that_few_matches_tie_is_the_least_certain() -> None:
     stds = center_stds(replace(model, observations={**model.observations, name: (pixels[:8], index[:8])}), MODELS)
     assert max(stds, key=lambda image: stds[image]) == name
     assert stds[name] > 3 * center_stds(model, MODELS)[name]
+
+
+def _two_sides(ties: int) -> SfmModel:
+    """Return a model of twelve photos, of which each half sees half of the points, the two middle ones `ties` more."""
+    model = _noisy(_scene(images=12, points=300), 3, noise_px=0.1)
+    seen = {}
+    for k, (name, (pixels, index)) in enumerate(model.observations.items()):
+        own = ((index < ties) & (k in (5, 6))) | ((index % 2 == 0) == (k < 6))
+        seen[name] = (pixels[own], index[own])
+    return replace(model, observations=seen)
+
+
+def test_two_sides_that_few_points_tie_are_less_certain_than_these_say() -> None:
+    ratio = {}
+    for ties in (6, 300):
+        model = _two_sides(ties)
+        ratio[ties] = max(pose_stds(model, MODELS)[0].values()) / max(center_stds(model, MODELS).values())
+    assert ratio[6] > 3.0 and 1.0 <= ratio[300] < 1.3, ratio
+
+
+def test_a_photo_with_few_matches_keeps_most_of_them() -> None:
+    model = _noisy(_scene(points=300), 1)
+    pixels, index = model.observations["03.jpg"]
+    few = replace(model, observations={**model.observations, "03.jpg": (pixels[:20], index[:20])})
+    doubted = pose_posterior.without_most_telling(few, MODELS, (), None)
+    left = {name: len(seen) for name, (_, seen) in doubted.observations.items()}
+    assert 15 <= left["03.jpg"] < 20 and len(doubted.points) == len(doubted.colors) < 300
+    assert sum(len(seen) for _, seen in few.observations.values()) - sum(left.values()) <= 0.005 * 1520
+    for name, (pixels, index) in doubted.observations.items():
+        drawn = model.camera(name).project(
+            doubted.points[index] @ model.T_cam_world[name][:3, :3].T + model.T_cam_world[name][:3, 3]
+        )
+        assert np.abs(drawn - pixels).max() < 6 * NOISE_PX  # each observation is still of its own point
+
+
+def test_no_distortion_is_as_uncertain_as_a_distortion_of_zero() -> None:
+    model = _noisy(_scene(points=300), 2)
+    none, some = (np.array(list(center_stds(model, {"photos": name}).values())) for name in LADDER[:2])
+    assert none == pytest.approx(some, rel=0.02)
 
 
 def test_known_intrinsics_make_centres_more_certain() -> None:
