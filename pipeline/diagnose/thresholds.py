@@ -148,6 +148,13 @@ class VerdictThresholds:
     enough_share: float = threshold(
         0.9, "1", "share of the excess that the named effects must remove; below it the verdict is `unexplained`"
     )
+    nearest_share: float = threshold(
+        0.6,
+        "1",
+        "share of the excess in flight below which effects that leave a significant remainder are called the nearest "
+        "in the library, not the missing ones",
+        "by argument: as `common_share`",
+    )
     repeated_p: float = threshold(
         0.01,
         "probability",

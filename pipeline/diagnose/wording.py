@@ -9,9 +9,11 @@ from ..physics.effects.effect import EffectParameter
 from ..report.page import listed
 from ..segments.prepare import Prepared
 from .evidence import Evidence, implausible
+from .flight_omnibus import is_significant
 from .law_export import further_terms
 from .own_accelerations import UPWARD
 from .remaining import bad_ones
+from .thresholds import THRESHOLDS
 from .verdict import Findings
 
 _DIFFERS = " Something is left in flight; it differs from episode to episode, as errors of the tracking do."
@@ -56,7 +58,20 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         others = [e.candidate.spec for e in one.equals[1:]]
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
     named = listed([word or name for word, name in zip(words, names, strict=True)])
-    return f"Missing: {named}.{_apart(findings)}{_rest(findings, law)}"
+    return f"{_called(findings)}: {named}.{_apart(findings)}{_rest(findings, law)}"
+
+
+def _called(findings: Findings) -> str:
+    """Return what the selected effects are called: where they explain too little, they are the nearest of the library.
+
+    An effect in no library does some of what one in it does.
+    """
+    found = findings.flight
+    partly = bool(found.in_flight) and is_significant(found.after)
+    if partly and found.explained_share < THRESHOLDS.verdict.nearest_share:
+        share = f"{100 * max(found.explained_share, 0.0):.0f} % of what exceeds the noise in flight"
+        return f"Nearest in the library, which explains {share}"
+    return "Missing"
 
 
 def _misfit(findings: Findings) -> str:

@@ -19,7 +19,7 @@ from cgwm.pipeline.diagnose.flight_selection import FlightSelection
 from cgwm.pipeline.diagnose.lasting_forces import without_lasting
 from cgwm.pipeline.diagnose.score_test import ScoreTest
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
-from cgwm.pipeline.diagnose.wording import law_warnings
+from cgwm.pipeline.diagnose.wording import _called, law_warnings
 from cgwm.pipeline.physics.contact_law import Touch
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.friction_ellipse import Ellipse
@@ -156,6 +156,18 @@ def test_friction_by_direction_is_not_named_where_a_pyramid_explains_slides_as_w
     findings: Any = SimpleNamespace(as_good=(), as_pyramid=("anisotropic_friction",))
     (said,) = law_warnings(findings)
     assert "pyramid" in said and "Next, " in said and "slides along x, along y and between" in said
+
+
+@pytest.mark.parametrize(
+    ("share", "left", "called"),
+    [(0.4, 3.0, "Nearest in the library, which explains 40 % "), (0.4, 1.2, "Missing"), (0.7, 3.0, "Missing")],
+)
+def test_a_name_that_leaves_most_is_the_nearest_in_the_library(share: float, left: float, called: str) -> None:
+    after = SimpleNamespace(statistic=left, p_value=1e-9)
+    findings: Any = SimpleNamespace(
+        flight=SimpleNamespace(in_flight=["linear_drag"], after=after, explained_share=share)
+    )
+    assert _called(findings).startswith(called)
 
 
 def test_a_gravity_that_sets_in_is_no_scale_of_lengths() -> None:
