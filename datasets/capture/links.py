@@ -38,7 +38,11 @@ def _read(root: Path, entry: Entry) -> Articulation:
             f"{where} lies outside the capture.", "a file of the capture directory.", "copy the file into it."
         )
     if optional_file(path) is None:
-        raise InputDataError(f"{where}: no such file.", "a path relative to the capture directory.")
+        raise InputDataError(
+            f"{where}: no such file.",
+            "a path relative to the capture directory.",
+            "add the file, or correct its name in capture.toml.",
+        )
     found = read_articulation(require_regular_file(path), bare_links=True).welded()
     moving = [joint for joint in found.joints if joint.kind != "fixed"]
     served = next((joint.name for joint in moving if joint.stiffness > 0), None)

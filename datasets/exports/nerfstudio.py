@@ -77,7 +77,9 @@ def place_of(chosen: Selection, rollout: int) -> int:
     indices = [info.index for info in chosen.reader.rollouts]
     if rollout not in indices:
         raise UsageError(
-            f"{chosen.path} has no rollout {rollout}.", f"{len(indices)} rollouts, {min(indices)} to {max(indices)}."
+            f"{chosen.path} has no rollout {rollout}.",
+            f"{len(indices)} rollouts, {min(indices)} to {max(indices)}.",
+            "name one of these with --rollout.",
         )
     return indices.index(rollout)
 

@@ -58,7 +58,7 @@ class Selection:
                 todo="leave --split out, or name another." if split else "synthesize it again.",
             )
         if every < 1:
-            raise UsageError(f"--every {every}: no step from frame to frame.", "1 or more.")
+            raise UsageError(f"--every {every}: no step from frame to frame.", "1 or more.", "pass a positive number.")
         self.every = every
         there = self.reader.cameras()
         if not there:
@@ -69,7 +69,11 @@ class Selection:
             )
         for name in cameras or ():
             if name not in there:
-                raise UsageError(f"{path} has no camera '{name}'.{did_you_mean(name, there)}", ", ".join(there))
+                raise UsageError(
+                    f"{path} has no camera '{name}'.{did_you_mean(name, there)}",
+                    ", ".join(there),
+                    "name one of these with --cameras.",
+                )
         self.cameras = tuple(cameras or there)
 
     def __len__(self) -> int:

@@ -279,7 +279,11 @@ def _require_enough_frames(source: Path, recordings: list[_Recording], n_train: 
 def _number(file: Path, frame: _Frame) -> int:
     found = re.fullmatch(r"r_\d+_(-?\d+)", Path(frame.file_path).stem)
     if found is None:
-        raise InputDataError(f"{file}: the picture '{frame.file_path}' has no frame number.", "r_<camera>_<frame>.png.")
+        raise InputDataError(
+            f"{file}: the picture '{frame.file_path}' has no frame number.",
+            "r_<camera>_<frame>.png.",
+            "take the original recording.",
+        )
     return int(found[1])
 
 
@@ -307,7 +311,9 @@ def _link(source: Path, place: str) -> tuple[Mesh, float, tuple[float, float, fl
             if not (0 < mass_kg < math.inf and math.isfinite(x + y + z)):
                 raise ValueError("a mass that is not positive, or a place that is not finite")
         except ValueError as error:
-            raise InputDataError(f"{urdf}: inertial: {error}.", "a mass [kg] and a centre of mass [m].") from None
+            raise InputDataError(
+                f"{urdf}: inertial: {error}.", "a mass [kg] and a centre of mass [m].", "take the original file."
+            ) from None
         path = urdf.parent / mesh.get("filename", "")
         _require_inside(path, source, str(urdf))
         return read_mesh(path), mass_kg, (x, y, z)
@@ -320,7 +326,11 @@ def _cameras(filmed: list[_Recording]) -> CamerasFile:
     for recording in filmed:
         for frame in recording.frames:
             if (frame.c2w, frame.intrinsic) != (first.c2w, first.intrinsic):
-                raise InputDataError(f"{recording.folder / frame.file_path}: its camera is another one.", "one camera.")
+                raise InputDataError(
+                    f"{recording.folder / frame.file_path}: its camera is another one.",
+                    "one camera.",
+                    "take the pictures of one camera.",
+                )
     width, height = image_size(filmed[0].folder / first.file_path)
     pose = np.eye(4)
     pose[:3] = np.array(first.c2w) * [1.0, -1.0, -1.0, 1.0]  # OpenGL's y and z point the other way

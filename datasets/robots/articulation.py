@@ -113,7 +113,11 @@ class Articulation:
             order += [joint.link for joint in below]
         if len(order) != len(links):
             lost = next(link for link in links if link not in order)
-            raise InputDataError(f"{path}: link '{lost}' hangs in a ring of joints.", "one tree of links.")
+            raise InputDataError(
+                f"{path}: link '{lost}' hangs in a ring of joints.",
+                "one tree of links.",
+                "leave out the joint that closes the ring.",
+            )
         _require_own_names(path, [joint.name for joint in placed])
         return Articulation(name=name, path=path, links=tuple(links[link] for link in order), joints=tuple(placed))
 
@@ -206,6 +210,7 @@ def _carriers(path: Path, links: dict[str, LinkOfRobot], joints: list[JointOfRob
                 raise InputDataError(
                     f"{path}: joint '{joint.name}' names the link '{end}', which is not there.",
                     ", ".join(links) + ".",
+                    "correct the name in the joint, or add the link.",
                 )
         if joint.link in above:
             raise InputDataError(
@@ -238,4 +243,6 @@ def _require_own_names(path: Path, names: list[str]) -> None:
     """
     if len(set(names)) < len(names):
         twice = next(one for one in names if names.count(one) > 1)
-        raise InputDataError(f"{path}: several joints are called '{twice}'.", "a name of its own for each joint.")
+        raise InputDataError(
+            f"{path}: several joints are called '{twice}'.", "a name of its own for each joint.", "rename one of them."
+        )

@@ -31,7 +31,11 @@ def read_mjcf(path: Path) -> Articulation:
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        raise InputDataError(f"{path}: MuJoCo cannot read it: {error}.", "an MJCF file.") from error
+        raise InputDataError(
+            f"{path}: MuJoCo cannot read it: {error}.",
+            "an MJCF file.",
+            "open the file in MuJoCo's viewer, which names the fault, and correct it.",
+        ) from error
     if model.neq:
         raise InputDataError(
             f"{path}: it has {model.neq} equality constraints (loops or joints that mimic others).",
@@ -41,7 +45,11 @@ def read_mjcf(path: Path) -> Articulation:
     trees = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
     if len(trees) != 1:
         names = ", ".join(model.body(body).name for body in trees)
-        raise InputDataError(f"{path}: it has {len(trees)} bodies in the world: {names}.", "one tree of bodies.")
+        raise InputDataError(
+            f"{path}: it has {len(trees)} bodies in the world: {names}.",
+            "one tree of bodies.",
+            "put the robot under one body of the world, or name a file with that body alone.",
+        )
     links: dict[str, LinkOfRobot] = {}
     joints: list[JointOfRobot] = []
     ends: dict[int, tuple[str, Array]] = {}

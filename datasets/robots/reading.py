@@ -26,7 +26,11 @@ def read_articulation(path: Path | str, bare_links: bool = False) -> Articulatio
     try:
         root = ElementTree.fromstring(path.read_bytes())
     except OSError as error:
-        raise InputDataError(f"{path}: it cannot be read: {error.strerror}.", "a URDF or MJCF file.") from error
+        raise InputDataError(
+            f"{path}: it cannot be read: {error.strerror}.",
+            "a URDF or MJCF file.",
+            "check the path, and that the file may be read.",
+        ) from error
     except ElementTree.ParseError:
         root = _without_prefixes(path)
     if root.tag == "robot":
@@ -34,7 +38,11 @@ def read_articulation(path: Path | str, bare_links: bool = False) -> Articulatio
     elif root.tag == "mujoco":
         found = read_mjcf(path)
     else:
-        raise InputDataError(f"{path}: its root element is <{root.tag}>.", "<robot> (URDF) or <mujoco> (MJCF).")
+        raise InputDataError(
+            f"{path}: its root element is <{root.tag}>.",
+            "<robot> (URDF) or <mujoco> (MJCF).",
+            "name the URDF or MJCF file of the robot.",
+        )
     found.require_metres()
     if not bare_links:
         found.require_geometry()
@@ -52,4 +60,6 @@ def _without_prefixes(path: Path) -> ElementTree.Element:
         parser.close()
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise InputDataError(f"{path}: it is not XML: {error}.", "a URDF or MJCF file.") from error
+        raise InputDataError(
+            f"{path}: it is not XML: {error}.", "a URDF or MJCF file.", "correct the file at that place."
+        ) from error

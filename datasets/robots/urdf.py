@@ -23,18 +23,24 @@ def read_urdf(path: Path, robot: Element) -> Articulation:
     for element in robot.findall("link"):
         name = _name(path, element, "link")
         if name in links:
-            raise InputDataError(f"{path}: several links are called '{name}'.", "a name of its own for each link.")
+            raise InputDataError(
+                f"{path}: several links are called '{name}'.", "a name of its own for each link.", "rename one of them."
+            )
         links[name] = _link(path, name, element)
     joints = [_joint(path, element) for element in robot.findall("joint")]
     if not joints:
-        raise InputDataError(f"{path}: the robot has no joints.", "a tree of links and joints.")
+        raise InputDataError(
+            f"{path}: the robot has no joints.",
+            "a tree of links and joints.",
+            "give the body its shape in capture.toml, without a robot's file.",
+        )
     return Articulation.tree(robot.get("name", path.stem), path, links, joints)
 
 
 def _name(path: Path, element: Element, what: str) -> str:
     name = element.get("name", "")
     if not name:
-        raise InputDataError(f"{path}: a {what} has no name.", f'<{what} name="...">.')
+        raise InputDataError(f"{path}: a {what} has no name.", f'<{what} name="...">.', "name it.")
     return name
 
 
@@ -45,7 +51,11 @@ def _numbers(path: Path, where: str, text: str | None, count: int, default: str)
     except ValueError:
         values = np.zeros(0)
     if len(values) != count or not np.isfinite(values).all():
-        raise InputDataError(f"{path}: {where}: '{text}'.", f"{count} finite number{'s' if count > 1 else ''}.")
+        raise InputDataError(
+            f"{path}: {where}: '{text}'.",
+            f"{count} finite number{'s' if count > 1 else ''}.",
+            "correct the number in the file.",
+        )
     return values
 
 
@@ -85,7 +95,9 @@ def _link(path: Path, name: str, element: Element) -> LinkOfRobot:
         weight, moments = inertial.find("mass"), inertial.find("inertia")
         mass = float(_numbers(path, f"{where}, mass", None if weight is None else weight.get("value"), 1, "")[0])
         if mass < 0:
-            raise InputDataError(f"{path}: {where}: its mass is {mass:g} kg.", "0 kg or more.")
+            raise InputDataError(
+                f"{path}: {where}: its mass is {mass:g} kg.", "0 kg or more.", "correct the mass in the file."
+            )
         keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
         if moments is not None:
             xx, yy, zz, xy, xz, yz = (
@@ -102,7 +114,9 @@ def _geometry(path: Path, where: str, element: Element) -> GeometryOfLink:
     shape = None if holder is None else next(iter(holder), None)
     if shape is None:
         raise InputDataError(
-            f"{path}: {where} has a collision element without geometry.", "box, sphere, cylinder, mesh."
+            f"{path}: {where} has a collision element without geometry.",
+            "box, sphere, cylinder, mesh.",
+            "add a geometry, or remove the collision element.",
         )
     mesh, size = None, ()
     if shape.tag == "box":
@@ -116,16 +130,24 @@ def _geometry(path: Path, where: str, element: Element) -> GeometryOfLink:
         found = read_mesh(_mesh_path(path, where, shape.get("filename", "")))
         mesh = Mesh(found.vertices * _numbers(path, f"{where}, scale", shape.get("scale"), 3, "1 1 1"), found.faces)
     else:
-        raise InputDataError(f"{path}: {where}: the geometry <{shape.tag}>.", "box, sphere, cylinder, mesh.")
+        raise InputDataError(
+            f"{path}: {where}: the geometry <{shape.tag}>.",
+            "box, sphere, cylinder, mesh.",
+            "replace it by one of these shapes.",
+        )
     if any(not x > 0 for x in size):
-        raise InputDataError(f"{path}: {where}: a {shape.tag} of size {size}.", "sizes above 0 m.")
+        raise InputDataError(
+            f"{path}: {where}: a {shape.tag} of size {size}.", "sizes above 0 m.", "correct the size in the file."
+        )
     return GeometryOfLink(kind=shape.tag, size_m=size, rotation=rotation, position_m=position, mesh=mesh)
 
 
 def _mesh_path(path: Path, where: str, name: str) -> Path:
     """Return the file of a mesh: relative to the URDF; of a package:// address, below any folder above it."""
     if not name:
-        raise InputDataError(f"{path}: {where}: a mesh without filename.", 'filename="...".')
+        raise InputDataError(
+            f"{path}: {where}: a mesh without filename.", 'filename="...".', "name the file of the mesh."
+        )
     if not name.startswith("package://"):
         return path.parent / name.removeprefix("file://")
     inside = name.removeprefix("package://")

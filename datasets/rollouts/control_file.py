@@ -138,7 +138,11 @@ def read_runs(path: Path) -> list[RunTables]:
     """
     with open_hdf5(path) as file, hdf5_faults(path):
         if file.attrs.get("format") != RUNS_FORMAT:
-            raise InputDataError(f"{path}: its format attribute is not '{RUNS_FORMAT}'.", f"'{RUNS_FORMAT}'.")
+            raise InputDataError(
+                f"{path}: its format attribute is not '{RUNS_FORMAT}'.",
+                f"'{RUNS_FORMAT}'.",
+                "name a file of runs that 'cgwm control' wrote.",
+            )
         for place, item in own_objects(file, str(path)):
             if isinstance(item, h5py.Dataset):
                 require_stored(item, f"{path}: {place}")
@@ -170,7 +174,11 @@ def _number(name: str) -> int:
 def _read(path: Path, name: str, demo: Node, robot: Literal["finger", "hand"], names: tuple[str, ...]) -> RunTables:
     arrays, table_of_commands = {}, _commands_of(robot)
     if _number(name) < 0:
-        raise InputDataError(f"{path}: data/{name}: no run.", "groups demo_<seed> in data.")
+        raise InputDataError(
+            f"{path}: data/{name}: no run.",
+            "groups demo_<seed> in data.",
+            "name a file of runs that 'cgwm control' wrote.",
+        )
     for key in (*table_of_commands, *PLANS):
         if key not in demo or not isinstance(demo[key], h5py.Dataset):
             raise InputDataError(f"{path}: data/{name} lacks the array '{key}'.", todo="take the original file.")

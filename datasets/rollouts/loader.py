@@ -149,7 +149,9 @@ class RolloutReader:
         except KeyError:
             names = self.keys(number)
             raise UsageError(
-                f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}", ", ".join(names)
+                f"rollout {number} has no array '{key}'.{did_you_mean(key, names)}",
+                ", ".join(names),
+                "name one of these arrays.",
             ) from None
         with hdf5_faults(self.rollouts[number].file):
             if data.attrs.get("encoding") == "jpeg":
@@ -173,6 +175,7 @@ class RolloutReader:
             raise UsageError(
                 f"frames {start} to {stop} of rollout {number}, which has {frames}.",
                 f"length and every of 1 or more, and a window within the frames 0 to {frames - 1}.",
+                "choose frames inside of the rollout.",
             )
         return {key: self.read(number, key, start, stop)[::every] for key in keys}
 
@@ -209,7 +212,9 @@ class RolloutDataset:
     ):
         span, step = (length - 1) * every + 1, stride or length * every
         if min(length, every, step) < 1:
-            raise UsageError(f"length {length}, stride {stride}, every {every}.", "1 or more.")
+            raise UsageError(
+                f"length {length}, stride {stride}, every {every}.", "1 or more.", "pass positive numbers."
+            )
         self.reader = RolloutReader(path, split)
         self.length, self.every = length, every
         self.windows = [
@@ -225,7 +230,11 @@ class RolloutDataset:
         there = self.reader.cameras() if len(self.reader) else []
         names = there if cameras is None else list(cameras)
         for name in set(names) - set(there):
-            raise UsageError(f"no camera '{name}'.{did_you_mean(name, there)}", ", ".join(there) or "none.")
+            raise UsageError(
+                f"no camera '{name}'.{did_you_mean(name, there)}",
+                ", ".join(there) or "none.",
+                "name one of these cameras.",
+            )
         wanted = ["bodies/pos", "bodies/quat_wxyz", "obs/{camera}_image"] if keys is None else keys
         every = [key.replace("{camera}", name) for key in wanted for name in (names if "{camera}" in key else [""])]
         for key in every if len(self.reader) else []:  # before workers start
@@ -259,12 +268,14 @@ def _list(handle: Node, file: Path, split: str | None) -> Iterable[RolloutInfo]:
     if split is not None:
         splits = list(handle["mask"])
         if split not in splits:
-            raise UsageError(f"{file} has no split '{split}'.", ", ".join(splits))
+            raise UsageError(f"{file} has no split '{split}'.", ", ".join(splits), "name one of these splits.")
         members = {name.decode() for name in handle["mask"][split][()]}
         names = [name for name in names if name in members]
     for name in names:
         demo = handle["data"][name]
         frames = int(demo.attrs["num_samples"])
         if not 0 <= frames <= MOST_FRAMES:
-            raise InputDataError(f"{file}: data/{name}: num_samples is {frames}.", f"0 to {MOST_FRAMES}.")
+            raise InputDataError(
+                f"{file}: data/{name}: num_samples is {frames}.", f"0 to {MOST_FRAMES}.", "write the dataset again."
+            )
         yield RolloutInfo(file, name, int(demo.attrs["episode_index"]), frames)

@@ -226,7 +226,11 @@ def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
         with hdf5_faults(path):
             found = file.attrs.get("format", "none")
             if not isinstance(found, str) or found != ROLLOUTS_FORMAT:
-                raise InputDataError(f"{path}: its format attribute is '{found!s:.80}'.", f"'{ROLLOUTS_FORMAT}'.")
+                raise InputDataError(
+                    f"{path}: its format attribute is '{found!s:.80}'.",
+                    f"'{ROLLOUTS_FORMAT}'.",
+                    "name a file that 'cgwm synthesize' wrote.",
+                )
             if "zstd" in str(file.attrs.get("filters", "")):
                 require_zstd(f"reading {path}")
             root: Node = file
@@ -277,7 +281,9 @@ def demo_names(file: h5py.File) -> list[str]:
         for name in data:
             where = f"{path}: data/{name!a:.80}"
             if not DEMO.fullmatch(name) or not is_own_link(data, name, where):
-                raise InputDataError(f"{where}: no rollout.", "groups demo_<index> in data.")
+                raise InputDataError(
+                    f"{where}: no rollout.", "groups demo_<index> in data.", "name a file that 'cgwm synthesize' wrote."
+                )
         return sorted(data, key=lambda name: int(name.removeprefix("demo_")))
 
 
@@ -306,7 +312,11 @@ def stored_demo(file: h5py.File, name: str) -> Node:
         data: Node = file["data"]
         demo: Node = data[name]
         if not hasattr(demo, "items"):
-            raise InputDataError(f"{path}: data/{name}: no rollout.", "groups demo_<index> in data.")
+            raise InputDataError(
+                f"{path}: data/{name}: no rollout.",
+                "groups demo_<index> in data.",
+                "name a file that 'cgwm synthesize' wrote.",
+            )
         where = f"{path}: data/{name}"
         with ExitStack() as stack:
 

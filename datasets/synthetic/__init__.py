@@ -70,7 +70,7 @@ def make_scene(
 
     if renderer not in RENDERERS:
         near = did_you_mean(renderer, RENDERERS)
-        raise UsageError(f"unknown renderer '{renderer}'.", ", ".join(RENDERERS) + "." + near)
+        raise UsageError(f"unknown renderer '{renderer}'.", ", ".join(RENDERERS) + "." + near, "name one of these.")
     if photos < 3 or min(*photo_size, *video_size) < 16:
         raise UsageError(
             f"{photos} photos of {photo_size[0]}x{photo_size[1]} px, videos of {video_size[0]}x{video_size[1]} px.",
@@ -99,7 +99,9 @@ def plan_scene(name: str, seed: int = 0) -> ScenePlan:
 
     planners: dict[str, Callable[[int], ScenePlan]] = {"fall": plan_fall, "push": plan_push}
     if name not in planners:
-        raise UsageError(f"unknown scene '{name}'.", ", ".join(SCENES) + "." + did_you_mean(name, SCENES))
+        raise UsageError(
+            f"unknown scene '{name}'.", ", ".join(SCENES) + "." + did_you_mean(name, SCENES), "name one of these."
+        )
     if not 0 <= seed <= MOST_SEED:
         raise UsageError(f"the seed is {seed}.", f"integers from 0 to {MOST_SEED}.", "pass another --seed.")
     return planners[name](seed)

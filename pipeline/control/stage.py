@@ -117,9 +117,9 @@ def control(
     """
     out = Path(out)
     if seeds < 1:
-        raise UsageError(f"--seeds {seeds}.", "1 or more.")
+        raise UsageError(f"--seeds {seeds}.", "1 or more.", "pass a positive number.")
     if not 0 <= draws <= MOST_DRAWS:
-        raise UsageError(f"--draws {draws}.", f"0 to {MOST_DRAWS}.")
+        raise UsageError(f"--draws {draws}.", f"0 to {MOST_DRAWS}.", "pass a number in this range.")
     clean_stale(out)
     finished = (out / DOCUMENT).is_file()
     if not (finished and resume):

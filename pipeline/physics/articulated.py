@@ -79,7 +79,11 @@ def _served(articulation: Articulation, servo: Servo | Mapping[str, Servo] | Non
     servos = servo if isinstance(servo, Mapping) else {name: servo for name in names if servo is not None}
     unknown = [name for name in servos if name not in names]
     if unknown:
-        raise UsageError(f"{articulation.path}: there is no moving joint '{unknown[0]}'.", ", ".join(names) + ".")
+        raise UsageError(
+            f"{articulation.path}: there is no moving joint '{unknown[0]}'.",
+            ", ".join(names) + ".",
+            "name one of these joints.",
+        )
     joints = []
     for joint in articulation.joints:
         given = servos.get(joint.name)

@@ -81,22 +81,30 @@ class Joint:
             InputDataError: If the kind is unknown or a number is not admissible.
         """
         if kind not in KINDS:
-            raise InputDataError(f"joint '{name}': its kind is '{kind}'.", ", ".join(KINDS) + ".")
+            raise InputDataError(
+                f"joint '{name}': its kind is '{kind}'.", ", ".join(KINDS) + ".", "correct the kind of the joint."
+            )
         like = torch.zeros((), dtype=torch.float64) if like is None else like
         size = math.sqrt(sum(x * x for x in axis))
         if not size > 1e-9:
             raise InputDataError(
-                f"joint '{name}': its axis is {tuple(axis)}.", "a direction: three numbers, not all 0."
+                f"joint '{name}': its axis is {tuple(axis)}.",
+                "a direction: three numbers, not all 0.",
+                "correct the axis of the joint.",
             )
         if not lower <= upper:
-            raise InputDataError(f"joint '{name}': its limits are {lower:g} and {upper:g}.", "lower <= upper.")
+            raise InputDataError(
+                f"joint '{name}': its limits are {lower:g} and {upper:g}.", "lower <= upper.", "exchange the limits."
+            )
         numbers = {
             "stiffness": stiffness, "damping": damping, "armature": armature, "friction": friction,
             "torque_limit": torque_limit,
         }  # fmt: skip
         for key, value in numbers.items():
             if not value >= 0 or (key != "torque_limit" and math.isinf(value)):
-                raise InputDataError(f"joint '{name}': {key} is {value:g}.", "0 or more, finite.")
+                raise InputDataError(
+                    f"joint '{name}': {key} is {value:g}.", "0 or more, finite.", "correct the number of the joint."
+                )
 
         def tensor(value: object) -> Tensor:
             return torch.as_tensor(value, dtype=like.dtype, device=like.device)[None]

@@ -54,6 +54,7 @@ def validate(
     raise InputDataError(
         f"{path}: {found}.",
         "a directory with capture.toml, model.json, dataset.json, improve.json, control.json or masks.json.",
+        "name a capture, a model, a dataset or a run.",
     )
 
 

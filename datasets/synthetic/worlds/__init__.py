@@ -31,7 +31,9 @@ def plan_world(name: str, seed: int = 0) -> WorldPlan:
         UsageError: If the name or the seed is not allowed.
     """
     if name not in _PLANNERS:
-        raise UsageError(f"unknown scene '{name}'.", ", ".join(WORLDS) + "." + did_you_mean(name, WORLDS))
+        raise UsageError(
+            f"unknown scene '{name}'.", ", ".join(WORLDS) + "." + did_you_mean(name, WORLDS), "name one of these."
+        )
     if not 0 <= seed <= MOST_SEED:
         raise UsageError(f"the seed is {seed}.", f"integers from 0 to {MOST_SEED}.", "pass another --seed.")
     return _PLANNERS[name](seed)
