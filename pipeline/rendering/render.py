@@ -18,10 +18,9 @@ import torch
 from torch import Tensor
 
 from ..runtime import kernel_build
-from . import composite_host, composite_reference
-from .composite_reference import TileLists
+from . import raster_host, raster_reference
 from .rasterize import Raster, rasterize
-from .tiles import Tiles, tile_pairs
+from .tiles import TiledScene, Tiles
 
 MIN_ALPHA = 1 / 255
 """Threshold on alpha below which a sphere does not contribute to a pixel."""
@@ -86,7 +85,7 @@ def render(
 
     Differentiable in means, scales, opacities, features, viewmats and background. A sphere is drawn if its centre lies
     in front of the camera by more than its scale, and its position is finite. float32 tensors on CUDA are rendered by
-    the kernels of `rasterize`, those on a CPU by torch and the program of `composite_host`, all others (and where
+    the kernels of `rasterize`, those on a CPU by torch and the program of `raster_host`, all others (and where
     neither can run) by plain torch, with the same result.
 
     Args:
@@ -129,7 +128,7 @@ def render(
         drawn = _draw_by_kernels(scene, min_alpha, min_transmittance, group_transmittance, capacity)
         drawn = drawn if median else replace(drawn, median_depth=None)
     else:
-        drawn = _draw_in_torch(scene, min_alpha, min_transmittance, group_transmittance, tile_size, median)
+        drawn = _draw_in_tiles(scene, min_alpha, min_transmittance, group_transmittance, tile_size, median)
     return drawn if background is None else _with_background(drawn, background)
 
 
@@ -192,7 +191,7 @@ def _draw_by_kernels(
     )
 
 
-def _draw_in_torch(
+def _draw_in_tiles(
     scene: _Scene,
     min_alpha: float,
     min_transmittance: float,
@@ -200,49 +199,30 @@ def _draw_in_torch(
     tile_size: int,
     median: bool,
 ) -> RenderOutput:
-    """Render in torch, in tiles, without a background."""
-    camera_count, scales, opacities, features = scene.viewmats.shape[0], scene.scales, scene.opacities, scene.features
-    local = scene.means @ scene.viewmats[:, :3, :3].transpose(1, 2) + scene.viewmats[:, None, :3, 3]
+    """Render in tiles, by the program of `raster_host` where it runs, else in torch, without a background."""
+    cameras = scene.viewmats.shape[0]
     tiles = Tiles.make(scene.Ks, scene.distortion, scene.width, scene.height, tile_size)
-    with torch.no_grad():
-        tile_ids, cameras, spheres = tile_pairs(local, scales, opacities, tiles, min_alpha)
-        counts = torch.bincount(tile_ids, minlength=tiles.count * camera_count)
-    order = torch.argsort(tile_ids, stable=True)
-    tile_ids, cameras, spheres = tile_ids[order], cameras[order], spheres[order]
-    flat = cameras * scales.shape[0] + spheres
-    centres = local.reshape(-1, 3).index_select(0, flat)
-    frame = tiles.frame_of(tile_ids)
-    coefficients = _coefficients(
-        (tiles.rotations[frame] @ centres[:, :, None])[:, :, 0],
-        scales.index_select(0, spheres),
-        opacities.index_select(0, spheres),
-    )
-    seen = features.index_select(0, spheres) if features.dim() == 2 else features.flatten(0, 1).index_select(0, flat)
-    channels = torch.cat([seen, centres[:, 2:]], 1)
-    every_tile = torch.arange(counts.shape[0], device=scene.means.device)
-    lists = TileLists(
-        basis=tiles.basis,
-        frame=tiles.frame_of(every_tile),
-        starts=counts.cumsum(0) - counts,
-        counts=counts,
+    given = TiledScene(
+        local=scene.means @ scene.viewmats[:, :3, :3].transpose(1, 2) + scene.viewmats[:, None, :3, 3],
+        scales=scene.scales,
+        opacities=scene.opacities,
+        features=scene.features,
+        tiles=tiles,
+        groups=scene.groups,
+        median=median,
         min_alpha=min_alpha,
         min_transmittance=min_transmittance,
+        group_transmittance=group_transmittance,
     )
-    values, alpha, middle = _composite(coefficients, channels, lists, median)
-    alone = None
-    if scene.groups:
-        with torch.no_grad():
-            single = replace(lists, min_transmittance=group_transmittance)
-            members = [(spheres >= group.start) & (spheres < group.stop) for group in scene.groups]
-            alphas = [_alone(coefficients, tile_ids, chosen, single) for chosen in members]
-            alone = tiles.to_image(torch.stack(alphas, 2), camera_count)
-    image = tiles.to_image(torch.cat([values, alpha[:, :, None]], 2), camera_count)
+    twin = raster_host if raster_host.supported(given.local) else raster_reference
+    drawn = twin.draw(given)
+    image = tiles.to_image(torch.cat([drawn.values, drawn.alpha[:, :, None]], 2), cameras)
     return RenderOutput(
         features=image[..., :-2],
         alpha=image[..., -1],
         weighted_depth=image[..., -2],
-        median_depth=tiles.to_image(middle[:, :, None], camera_count)[..., 0] if median else None,
-        alone=alone,
+        median_depth=tiles.to_image(drawn.median[:, :, None], cameras)[..., 0] if median else None,
+        alone=None if drawn.alone is None else tiles.to_image(drawn.alone, cameras),
     )
 
 
@@ -250,41 +230,3 @@ def _with_background(drawn: RenderOutput, background: Tensor) -> RenderOutput:
     """Return a rendering with features (F,) or (C, F) behind it."""
     behind = background.expand(drawn.features.shape[0], -1)[:, None, None, :]
     return replace(drawn, features=drawn.features + (1 - drawn.alpha)[..., None] * behind)
-
-
-def _alone(coefficients: Tensor, tile_ids: Tensor, chosen: Tensor, lists: TileLists) -> Tensor:
-    """Return the alpha (T, P) of a subset of the pairs, as if the other pairs did not exist."""
-    counts = torch.bincount(tile_ids[chosen], minlength=lists.counts.shape[0])
-    subset = replace(lists, starts=counts.cumsum(0) - counts, counts=counts)
-    return _composite(coefficients[chosen], coefficients[chosen, :1], subset)[1]
-
-
-def _composite(
-    coefficients: Tensor, features: Tensor, lists: TileLists, median: bool = False
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Composite by the compiled program where it runs, else in torch; see `composite_reference.composite`."""
-    twin = composite_host if composite_host.supported(features) else composite_reference
-    return twin.composite(coefficients, features, lists, median)
-
-
-def _coefficients(centres: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
-    """Return the exponent's coefficients of (1, x, y, x^2, xy, y^2) / (1 + x^2 + y^2), shape (M, 6).
-
-    The logarithm of the opacity is added to the coefficients of 1, x^2 and y^2, whose quotients sum to 1.
-    """
-    px, py, pz = centres.unbind(1)
-    k = -0.5 / (scales * scales)
-    log_opacity = opacities.clamp_min(1e-12).log()
-    kx, ky, kz = k * px, k * py, k * pz
-    xx, yy, zz = kx * px, ky * py, kz * pz
-    return torch.stack(
-        [
-            xx + yy + log_opacity,
-            -2 * kx * pz,
-            -2 * ky * pz,
-            zz + yy + log_opacity,
-            -2 * kx * py,
-            zz + xx + log_opacity,
-        ],
-        1,
-    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -89,6 +90,46 @@ class Tiles:
         return grid[:, : self.height, : self.width]
 
 
+@dataclass(frozen=True, kw_only=True)
+class TiledScene:
+    """Spheres in the axes of C cameras, and what of them is drawn in tiles; see `render` for what is not said here."""
+
+    local: Tensor
+    """Centres [m], camera axes, shape (C, N, 3)."""
+    scales: Tensor
+    """Standard deviations [m], shape (N,)."""
+    opacities: Tensor
+    """Peak alphas, shape (N,)."""
+    features: Tensor
+    """Shape (N, F) or (C, N, F)."""
+    tiles: Tiles
+    """The tiles."""
+    groups: Sequence[slice]
+    """Groups of spheres (G) whose opacity alone is also drawn."""
+    median: bool
+    """Whether the median depth is drawn."""
+    min_alpha: float
+    """Threshold below which an alpha counts as 0."""
+    min_transmittance: float
+    """Threshold on the transmittance below which spheres behind are skipped."""
+    group_transmittance: float
+    """The same for the groups."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiledImages:
+    """What T = C * tiles of P pixels show."""
+
+    values: Tensor
+    """Features and depth, not divided by alpha, shape (T, P, F + 1)."""
+    alpha: Tensor
+    """Shape (T, P)."""
+    median: Tensor
+    """Median depth, 0 where it was not requested, shape (T, P); without derivative."""
+    alone: Tensor | None
+    """Alpha of each group alone, shape (T, P, G); without derivative. None without groups."""
+
+
 def _frames(axis: Tensor) -> Tensor:
     """Return rotations whose third row is `axis` (n, 3), a unit vector; shape (n, 3, 3)."""
     helper = torch.zeros_like(axis)
@@ -99,13 +140,41 @@ def _frames(axis: Tensor) -> Tensor:
     return torch.stack([first, torch.linalg.cross(axis, first), axis], 1)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ViewCones:
+    """Cones around what C cameras see of N spheres, each to where its alpha falls to a threshold."""
+
+    direction: Tensor
+    """Unit vectors to the centres, camera frames, shape (C, N, 3)."""
+    half: Tensor
+    """Half angles [rad], shape (C, N)."""
+    order: Tensor
+    """Spheres, nearest first, those that are not drawn last, shape (C, N)."""
+    drawn: Tensor
+    """Number of spheres that are drawn, shape (C,)."""
+
+    @staticmethod
+    def of(local: Tensor, scales: Tensor, opacities: Tensor, min_alpha: float) -> ViewCones:
+        """Return the cones of spheres; arguments as of `tile_pairs`."""
+        distance = local.norm(dim=2)
+        drawn = (local[..., 2] > scales) & torch.isfinite(distance)
+        if min_alpha > 0:
+            drawn &= opacities > min_alpha
+            reach = scales * (2 * (opacities / min_alpha).clamp_min(1.0).log()).sqrt()
+            half = torch.asin((reach / distance).clamp_max(1.0))
+        else:
+            half = torch.full_like(distance, math.pi)
+        order = torch.argsort(torch.where(drawn, distance, torch.inf), dim=1, stable=True)
+        return ViewCones(direction=local / distance[..., None], half=half, order=order, drawn=drawn.sum(1))
+
+
 def tile_pairs(
     local: Tensor, scales: Tensor, opacities: Tensor, tiles: Tiles, min_alpha: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """List the pairs of tiles and spheres that intersect, nearest first within a tile.
 
-    A sphere extends to where its alpha falls to `min_alpha`; it intersects a tile if the cone around it intersects the
-    cone around the tile. Blocks of tiles are tested first, then their tiles.
+    A sphere intersects a tile if the cone around it (`ViewCones`) intersects the cone around the tile. Blocks of tiles
+    are tested first, then their tiles.
 
     Args:
         local: Centres [m], camera frames, shape (C, N, 3).
@@ -117,23 +186,14 @@ def tile_pairs(
     Returns:
         Tile number (camera * tiles + tile), camera and sphere of each pair, three arrays (M,).
     """
-    distance = local.norm(dim=2)
-    drawn = (local[..., 2] > scales) & torch.isfinite(distance)
-    if min_alpha > 0:
-        drawn &= opacities > min_alpha
-        reach = scales * (2 * (opacities / min_alpha).clamp_min(1.0).log()).sqrt()
-        cone = torch.asin((reach / distance).clamp_max(1.0))
-    else:
-        cone = torch.full_like(distance, math.pi)
-    order = torch.argsort(torch.where(drawn, distance, torch.inf), dim=1, stable=True)
+    cones = ViewCones.of(local, scales, opacities, min_alpha)
     axes = tiles.rotations[:, 2].reshape(-1, tiles.rows, tiles.columns, 3)
     half = tiles.half_angle.reshape(-1, tiles.rows, tiles.columns)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     for camera in range(local.shape[0]):
-        ranked = order[camera, : int(drawn[camera].sum())]
-        direction = local[camera, ranked] / distance[camera, ranked, None]
+        ranked = cones.order[camera, : int(cones.drawn[camera])]
         group = int(tiles.group[camera])
-        tile, position = _meet(axes[group], half[group], direction, cone[camera, ranked])
+        tile, position = _meet(axes[group], half[group], cones.direction[camera, ranked], cones.half[camera, ranked])
         found.append((tile + camera * tiles.count, torch.full_like(tile, camera), ranked[position]))
     tile_ids, cameras, spheres = (torch.cat(parts) for parts in zip(*found, strict=True))
     return tile_ids, cameras, spheres

@@ -1,34 +1,5 @@
-// Front-to-back compositing of tile lists on the CPU, see `composite_host`; C++14. SINGLE chooses the type of numbers.
-#include <cmath>
-#include <cstdint>
-#include <cstring>
-#include <pthread.h>
+// Front-to-back compositing of the lists of tiles, and its derivatives.
 
-// One library has the loops for several kinds of processor, and the loader takes those for this one: caches are shared.
-#if defined(__x86_64__) && defined(__GLIBC__)
-#define FOR_EACH_PROCESSOR __attribute__((target_clones("avx512f", "avx2", "default")))
-#else
-#define FOR_EACH_PROCESSOR
-#endif
-#define INLINE static inline __attribute__((always_inline))
-
-#if SINGLE
-typedef float Number;
-typedef int32_t Word;
-#define MANTISSA_BITS 23
-#define EXPONENT_BIAS 127
-#define LOWEST -87.0f
-#define HIGHEST 88.0f
-#define TERMS 7
-#else
-typedef double Number;
-typedef int64_t Word;
-#define MANTISSA_BITS 52
-#define EXPONENT_BIAS 1023
-#define LOWEST -708.0
-#define HIGHEST 709.0
-#define TERMS 13
-#endif
 // Pixels that are computed together, and partial sums over them: several vectors of the widest registers.
 #define BLOCK 64
 #define PARTS 16
@@ -70,23 +41,75 @@ INLINE Number product(const Number* a, const Number* b) {
     return total(parts);
 }
 
-struct Lists {  // see `TileLists`; M pairs, T tiles, P pixels
-    const Number *coefficients;  // (M, 6)
-    const Number *features;      // (M, channels)
-    const Number *basis;         // (K, P, 6)
-    const int64_t *frame, *starts, *counts;
-    int tiles, pixels, channels;
+struct Lists {  // C cameras, N spheres, M pairs, T tiles, P pixels; K rows of tile frames
+    const Number* centres;      // camera axes, (C * N, 3)
+    const Number *scales, *opacities;  // (N)
+    const Number* features;     // (N, channels), or (C * N, channels) where they differ by camera
+    const Number* basis;        // monomials (1, x, y, x^2, x y, y^2) / (1 + x^2 + y^2) of the pixels, (K, P, 6)
+    const Number* rotations;    // from camera to tile axes, (K, 3, 3)
+    const int64_t *frame, *starts, *counts;  // row of a tile's frame; its first pair, and how many it has, (T)
+    const int64_t* places;      // camera * N + sphere of each pair, nearest first, (M)
+    int spheres, tiles, pixels, channels, by_camera;
+    int first_sphere, end_sphere;  // others are not seen
     Number min_alpha, min_transmittance;
+
+    bool asked(int64_t place) const {
+        return place % spheres >= first_sphere && place % spheres < end_sphere;
+    }
+    const Number* color(int64_t place) const { return features + (by_camera ? place : place % spheres) * channels; }
 };
 
-struct Results {
-    Number *out, *left, *middle;  // (T, P, channels), (T, P) and (T, P), the last null where it is not asked for
+struct Results {  // the last of the channels + 1 of `out` is the depth
+    Number *out, *left, *middle;  // (T, P, channels + 1), (T, P) and (T, P), the last null where it is not asked for
 };
 
 struct Gradients {
-    const Number *out, *alpha;         // with respect to the results, as those
-    Number *coefficients, *features;  // with respect to the inputs, as those
+    const Number *out, *alpha;  // with respect to the results, as those
+    Number* pairs;              // of each pair by centre, scale, opacity and features, (M, 5 + channels)
 };
+
+// A sphere in the frame of a tile: its alpha is exp(basis . coefficients). In the frame of a tile, whose z axis is the
+// ray through the tile's centre, the squared distance from a centre p to the ray (x, y, 1) is a quadratic polynomial,
+//     dist^2 (1 + x^2 + y^2) = (px - pz x)^2 + (py - pz y)^2 + (px y - py x)^2        (derived: |p x d|^2 / |d|^2).
+struct Seen {
+    Number x, y, z, k;  // its place, and -1 / (2 scale^2)
+    Number coefficients[6];
+};
+
+#define LEAST_OPACITY Number(1e-12)
+
+INLINE Seen seen_from(const Lists& lists, int64_t place, const Number* turn) {
+    const Number* c = lists.centres + 3 * place;
+    Number scale = lists.scales[place % lists.spheres], opacity = lists.opacities[place % lists.spheres];
+    Number log_opacity = std::log(opacity < LEAST_OPACITY ? LEAST_OPACITY : opacity);
+    Seen s;
+    s.x = turn[0] * c[0] + turn[1] * c[1] + turn[2] * c[2];
+    s.y = turn[3] * c[0] + turn[4] * c[1] + turn[5] * c[2];
+    s.z = turn[6] * c[0] + turn[7] * c[1] + turn[8] * c[2];
+    s.k = Number(-0.5) / (scale * scale);
+    Number kx = s.k * s.x, ky = s.k * s.y, xx = kx * s.x, yy = ky * s.y, zz = s.k * s.z * s.z;
+    s.coefficients[0] = xx + yy + log_opacity;
+    s.coefficients[1] = Number(-2) * kx * s.z;
+    s.coefficients[2] = Number(-2) * ky * s.z;
+    s.coefficients[3] = zz + yy + log_opacity;
+    s.coefficients[4] = Number(-2) * kx * s.y;
+    s.coefficients[5] = zz + xx + log_opacity;
+    return s;
+}
+
+// Adds the derivatives by centre, scale and opacity to five numbers, from those by the coefficients.
+INLINE void add_slopes(const Lists& lists, int64_t place, const Number* turn, const Seen& s, const Number* g, Number* to) {
+    Number x = s.x, y = s.y, z = s.z, twice = Number(2) * s.k, scale = lists.scales[place % lists.spheres];
+    Number by_x = twice * ((g[0] + g[5]) * x - g[1] * z - g[4] * y);
+    Number by_y = twice * ((g[0] + g[3]) * y - g[2] * z - g[4] * x);
+    Number by_z = twice * ((g[3] + g[5]) * z - g[1] * x - g[2] * y);
+    for (int axis = 0; axis < 3; axis++) to[axis] += turn[axis] * by_x + turn[3 + axis] * by_y + turn[6 + axis] * by_z;
+    Number by_k = (g[0] + g[5]) * x * x + (g[0] + g[3]) * y * y + (g[3] + g[5]) * z * z -
+                  Number(2) * (g[1] * x * z + g[2] * y * z + g[4] * x * y);
+    to[3] += by_k / (scale * scale * scale);
+    Number opacity = lists.opacities[place % lists.spheres];
+    if (opacity >= LEAST_OPACITY) to[4] += (g[0] + g[3] + g[5]) / opacity;
+}
 
 // Up to BLOCK pixels of a tile. Those that are missing start with a transmittance of 0, so that nothing is seen there.
 struct Block {
@@ -141,22 +164,26 @@ INLINE void shade(Number least, Block& block) {
 
 INLINE Number limited(Number alpha) { return alpha > MAX_ALPHA ? MAX_ALPHA : alpha; }
 
-// The scratch has `channels` rows of BLOCK sums.
+// The scratch has a row of BLOCK sums for each channel, and one for the depth.
 INLINE void forward_block(const Lists& lists, Results& results, int64_t tile, int first, Number least, Number* sums) {
     Block block;
     alignas(64) Number middle[BLOCK] = {};
     open(lists, tile, first, block);
-    memset(sums, 0, sizeof(Number) * BLOCK * lists.channels);
+    int width = lists.channels + 1;
+    memset(sums, 0, sizeof(Number) * BLOCK * width);
+    const Number* turn = lists.rotations + 9 * lists.frame[tile];
     for (int64_t i = 0; i < lists.counts[tile] && !finished(lists, block, i); i++) {
-        int64_t row = lists.starts[tile] + i;
-        if (!seen(lists.coefficients + 6 * row, least, block)) continue;
+        int64_t place = lists.places[lists.starts[tile] + i];
+        if (!lists.asked(place)) continue;
+        Seen sphere = seen_from(lists, place, turn);
+        if (!seen(sphere.coefficients, least, block)) continue;
         shade(least, block);
-        const Number* features = lists.features + row * lists.channels;
-        Number last = features[lists.channels - 1];
+        const Number* color = lists.color(place);
+        Number depth = lists.centres[3 * place + 2];
         if (results.middle) {
             EACH_PIXEL(p) {
                 Number after = block.left[p] - limited(block.alpha[p]) * block.left[p];
-                middle[p] += block.left[p] > Number(0.5) && after <= Number(0.5) ? last : Number(0);
+                middle[p] += block.left[p] > Number(0.5) && after <= Number(0.5) ? depth : Number(0);
             }
         }
         EACH_PIXEL(p) {
@@ -164,46 +191,52 @@ INLINE void forward_block(const Lists& lists, Results& results, int64_t tile, in
             block.weight[p] = alpha * block.left[p];
             block.left[p] *= Number(1) - alpha;
         }
-        for (int c = 0; c < lists.channels; c++) {
-            Number feature = features[c], *sum = sums + c * BLOCK;
-            EACH_PIXEL(p) sum[p] += block.weight[p] * feature;
+        for (int c = 0; c < width; c++) {
+            Number value = c < lists.channels ? color[c] : depth, *sum = sums + c * BLOCK;
+            EACH_PIXEL(p) sum[p] += block.weight[p] * value;
         }
     }
     int64_t at = tile * lists.pixels + first;
     for (int p = 0; p < block.count; p++) {
         results.left[at + p] = block.left[p];
         if (results.middle) results.middle[at + p] = middle[p];
-        for (int c = 0; c < lists.channels; c++) results.out[(at + p) * lists.channels + c] = sums[c * BLOCK + p];
+        for (int c = 0; c < width; c++) results.out[(at + p) * width + c] = sums[c * BLOCK + p];
     }
 }
 
-// The scratch has `channels` rows of BLOCK derivatives. Adds to the derivatives of a tile's pairs, which are its own.
+// The scratch has a row of BLOCK derivatives for each channel, and one for the depth. Adds to the derivatives of a
+// tile's pairs, which are its own.
 INLINE void backward_block(const Lists& lists, const Results& results, Gradients& gradients, int64_t tile, int first,
-                           Number least, Number* by_color) {
+                           Number least, Number* by_value) {
     Block block;
     // what lies behind a sphere contributes: first the whole pixel, from which each sphere that is passed is taken
     alignas(64) Number rest[BLOCK] = {}, along[BLOCK], gradient[BLOCK];
     open(lists, tile, first, block);
-    memset(by_color, 0, sizeof(Number) * BLOCK * lists.channels);
+    int width = lists.channels + 1;
+    memset(by_value, 0, sizeof(Number) * BLOCK * width);
     int64_t at = tile * lists.pixels + first;
     for (int p = 0; p < block.count; p++) {
-        for (int c = 0; c < lists.channels; c++) {
-            Number by = gradients.out[(at + p) * lists.channels + c];
-            by_color[c * BLOCK + p] = by;
-            rest[p] += by * results.out[(at + p) * lists.channels + c];
+        for (int c = 0; c < width; c++) {
+            Number by = gradients.out[(at + p) * width + c];
+            by_value[c * BLOCK + p] = by;
+            rest[p] += by * results.out[(at + p) * width + c];
         }
         rest[p] -= gradients.alpha[at + p] * results.left[at + p];
     }
+    const Number* turn = lists.rotations + 9 * lists.frame[tile];
     for (int64_t i = 0; i < lists.counts[tile] && !finished(lists, block, i); i++) {
-        int64_t row = lists.starts[tile] + i;
-        if (!seen(lists.coefficients + 6 * row, least, block)) continue;
+        int64_t pair = lists.starts[tile] + i, place = lists.places[pair];
+        if (!lists.asked(place)) continue;
+        Seen sphere = seen_from(lists, place, turn);
+        if (!seen(sphere.coefficients, least, block)) continue;
         shade(least, block);
-        const Number* features = lists.features + row * lists.channels;
-        EACH_PIXEL(p) along[p] = Number(0);
+        const Number* color = lists.color(place);
+        Number depth = lists.centres[3 * place + 2];
+        EACH_PIXEL(p) along[p] = depth * by_value[lists.channels * BLOCK + p];
         for (int c = 0; c < lists.channels; c++) {
-            Number feature = features[c];
-            const Number* by = by_color + c * BLOCK;
-            EACH_PIXEL(p) along[p] += by[p] * feature;
+            Number value = color[c];
+            const Number* by = by_value + c * BLOCK;
+            EACH_PIXEL(p) along[p] += by[p] * value;
         }
         EACH_PIXEL(p) {
             // d out / d alpha_i = T_i f_i - sum_(j > i) w_j f_j / (1 - alpha_i), and d alpha / d exponent = alpha
@@ -214,10 +247,11 @@ INLINE void backward_block(const Lists& lists, const Results& results, Gradients
             block.weight[p] = weight;
             block.left[p] *= keep;
         }
-        for (int c = 0; c < lists.channels; c++) {
-            gradients.features[row * lists.channels + c] += product(block.weight, by_color + c * BLOCK);
-        }
-        for (int k = 0; k < 6; k++) gradients.coefficients[row * 6 + k] += product(gradient, block.basis[k]);
+        Number by_coefficients[6], *to = gradients.pairs + pair * (5 + lists.channels);
+        for (int k = 0; k < 6; k++) by_coefficients[k] = product(gradient, block.basis[k]);
+        add_slopes(lists, place, turn, sphere, by_coefficients, to);
+        to[2] += product(block.weight, by_value + lists.channels * BLOCK);
+        for (int c = 0; c < lists.channels; c++) to[5 + c] += product(block.weight, by_value + c * BLOCK);
     }
 }
 
@@ -230,9 +264,13 @@ struct Queue {
 
 #define SHARE 4  // tiles that a thread takes at once
 
+INLINE Number least_exponent(const Lists& lists) {
+    return lists.min_alpha > Number(0) ? (Number)std::log(lists.min_alpha) : -std::numeric_limits<Number>::infinity();
+}
+
 FOR_EACH_PROCESSOR
 void forward_tiles(Queue& queue, int first, int end, Number* scratch) {
-    Number least = queue.lists.min_alpha > Number(0) ? (Number)std::log(queue.lists.min_alpha) : Number(-INFINITY);
+    Number least = least_exponent(queue.lists);
     for (int tile = first; tile < end; tile++) {
         for (int p = 0; p < queue.lists.pixels; p += BLOCK) {
             forward_block(queue.lists, queue.results, tile, p, least, scratch);
@@ -242,7 +280,7 @@ void forward_tiles(Queue& queue, int first, int end, Number* scratch) {
 
 FOR_EACH_PROCESSOR
 void backward_tiles(Queue& queue, int first, int end, Number* scratch) {
-    Number least = queue.lists.min_alpha > Number(0) ? (Number)std::log(queue.lists.min_alpha) : Number(-INFINITY);
+    Number least = least_exponent(queue.lists);
     for (int tile = first; tile < end; tile++) {
         for (int p = 0; p < queue.lists.pixels; p += BLOCK) {
             backward_block(queue.lists, queue.results, *queue.gradients, tile, p, least, scratch);
@@ -250,48 +288,53 @@ void backward_tiles(Queue& queue, int first, int end, Number* scratch) {
     }
 }
 
-static void* work(void* shared) {
+static void* composite_tiles(void* shared) {
     Queue& queue = *static_cast<Queue*>(shared);
-    Number* scratch = new Number[BLOCK * queue.lists.channels];
-    for (int first; (first = __atomic_fetch_add(&queue.next, SHARE, __ATOMIC_RELAXED)) < queue.lists.tiles;) {
-        int end = first + SHARE < queue.lists.tiles ? first + SHARE : queue.lists.tiles;
-        (queue.gradients ? backward_tiles : forward_tiles)(queue, first, end, scratch);
+    int tiles = queue.lists.tiles;
+    Array<Number> scratch(BLOCK * (queue.lists.channels + 1));
+    for (int first; (first = __atomic_fetch_add(&queue.next, SHARE, __ATOMIC_RELAXED)) < tiles;) {
+        int end = first + SHARE < tiles ? first + SHARE : tiles;
+        (queue.gradients ? backward_tiles : forward_tiles)(queue, first, end, scratch.values);
     }
-    delete[] scratch;
     return nullptr;
 }
 
-static void share_out(int threads, Queue& queue) {
-    pthread_t* others = new pthread_t[threads];
-    int count = 0;  // where the system gives no more threads, those that there are do the work
-    while (count + 1 < threads && pthread_create(&others[count], nullptr, work, &queue) == 0) count++;
-    work(&queue);
-    while (count > 0) pthread_join(others[--count], nullptr);
-    delete[] others;
-}
-
-#define LISTS                                                                                                      \
-    const Number *coefficients, const Number *features, const Number *basis, const int64_t *frame,                 \
-        const int64_t *starts, const int64_t *counts, int tiles, int pixels, int channels, double min_alpha,       \
-        double min_transmittance
-#define GIVEN                                                                                             \
-    {                                                                                                     \
-        coefficients, features, basis, frame, starts, counts, tiles, pixels, channels, (Number)min_alpha, \
-            (Number)min_transmittance                                                                     \
+#define LISTS                                                                                                       \
+    const Number *centres, const Number *scales, const Number *opacities, const Number *features,                   \
+        const Number *basis, const Number *rotations, const int64_t *frame, const int64_t *starts,                  \
+        const int64_t *counts, const int64_t *places, int spheres, int tiles, int pixels, int channels,             \
+        int by_camera, int first_sphere, int end_sphere, double min_alpha, double min_transmittance
+#define GIVEN                                                                                                       \
+    {                                                                                                               \
+        centres, scales, opacities, features, basis, rotations, frame, starts, counts, places, spheres, tiles,      \
+            pixels, channels, by_camera, first_sphere, end_sphere, (Number)min_alpha, (Number)min_transmittance     \
     }
 
 extern "C" void composite_forward(int threads, LISTS, Number* out, Number* left, Number* middle) {
     const Lists lists = GIVEN;
     Results results = {out, left, middle};
     Queue queue = {lists, results, nullptr, 0};
-    share_out(threads, queue);
+    in_threads(threads, composite_tiles, &queue);
 }
 
+// Adds to the derivatives by centres (C * N, 3), scales, opacities and features, and the pairs are
+// added up one after another, so that the sums do not depend on the number of threads.
 extern "C" void composite_backward(int threads, LISTS, Number* out, Number* left, const Number* grad_out,
-                                   const Number* grad_alpha, Number* grad_coefficients, Number* grad_features) {
+                                   const Number* grad_alpha, int pairs, Number* by_centre, Number* by_scale,
+                                   Number* by_opacity, Number* by_feature) {
     const Lists lists = GIVEN;
     Results results = {out, left, nullptr};
-    Gradients gradients = {grad_out, grad_alpha, grad_coefficients, grad_features};
+    int width = 5 + channels;
+    Array<Number> by_pair((int64_t)pairs * width);
+    Gradients gradients = {grad_out, grad_alpha, by_pair.values};
     Queue queue = {lists, results, &gradients, 0};
-    share_out(threads, queue);
+    in_threads(threads, composite_tiles, &queue);
+    for (int64_t pair = 0; pair < pairs; pair++) {
+        const Number* from = by_pair.values + pair * width;
+        int64_t place = places[pair], sphere = place % spheres, row = by_camera ? place : sphere;
+        for (int axis = 0; axis < 3; axis++) by_centre[3 * place + axis] += from[axis];
+        by_scale[sphere] += from[3];
+        by_opacity[sphere] += from[4];
+        for (int c = 0; c < channels; c++) by_feature[row * channels + c] += from[5 + c];
+    }
 }

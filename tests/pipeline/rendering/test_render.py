@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.cameras import distort
-from cgwm.pipeline.rendering import composite_host
+from cgwm.pipeline.rendering import raster_host
 from cgwm.pipeline.rendering.render import render
 
 EXACT = {"min_alpha": 0.0, "min_transmittance": 0.0}
@@ -102,7 +102,7 @@ def rotation(seed=1):
 @pytest.mark.parametrize("compiled", [True, False])
 def test_values_equal_the_twin(compiled, monkeypatch):
     if not compiled:
-        monkeypatch.setattr(composite_host, "supported", lambda _: False)
+        monkeypatch.setattr(raster_host, "supported", lambda _: False)
     arguments = scene()
     background = torch.tensor([0.2, 0.5, 0.8], dtype=torch.float64)
     output = render(*arguments, 25, 19, background, **EXACT)
