@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.capture.images import read_rgb
+from ...datasets.io.processors import processors
 from ...schemas import CalibrateConfig, NotConvergedError
 from ...schemas.calibration import CalibrationAttempt, ImageVerdict, PairFigures, SelfCheckFigures
 from . import colmap
@@ -208,13 +210,13 @@ def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[Mapped], st
 
 def _supported(mapped: Mapped, start: str, inputs: Inputs, seed: int) -> tuple[Mapped, str]:
     """Return a model without outliers, with cameras as rich as its observations support, and how rich they are."""
-    steps = [
-        (model, adjusted(mapped, limited(model, inputs), inputs.known, seed))
-        for model in richer(start, "SIMPLE_PINHOLE" if _all_known(inputs) else "OPENCV")
-    ]
+    tried = richer(start, "SIMPLE_PINHOLE" if _all_known(inputs) else "OPENCV")
+    with ThreadPoolExecutor(min(processors(), len(tried))) as pool:  # COLMAP adjusts each in one thread
+        found = pool.map(lambda model: adjusted(mapped, limited(model, inputs), inputs.known, seed), tried)
+        steps = dict(zip(tried, found, strict=True))
     free = len(set(mapped.names.values()) - set(inputs.known))
-    taken = supported([(model, step.residuals_px()) for model, step in steps], free)
-    return without_outliers(dict(steps)[taken], inputs.known, seed), taken
+    taken = supported([(model, step.residuals_px()) for model, step in steps.items()], free)
+    return without_outliers(steps[taken], inputs.known, seed), taken
 
 
 def _uncertain(mapped: Mapped, camera_model: str, inputs: Inputs) -> bool:

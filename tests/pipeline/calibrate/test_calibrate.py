@@ -326,7 +326,8 @@ def test_known_intrinsics_are_used_and_two_runs_give_the_same_bytes_on_any_numbe
     monkeypatch.setattr(colmap, "_EXTRACTION_CHUNK", 1)
     monkeypatch.setattr(colmap, "_MATCHING_BLOCK", 2)
     for processors in (1, 3):
-        monkeypatch.setattr(colmap, "processors", lambda count=processors: count)
+        for module in (attempts, colmap):
+            monkeypatch.setattr(module, "processors", lambda count=processors: count)
         calibrate(root, CalibrateConfig(max_features=400), overwrite=processors > 1)
         written.append((root / "cameras.json").read_bytes())
     assert written[0] == written[1]
