@@ -98,8 +98,7 @@ def rebound_speed(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffec
 
     slip = point_velocity(impact.before, impact.arm)
     slip = slip - (slip @ impact.normal)[:, None] * impact.normal
-    probe = _touched(impact, law, effects, slip, None)
-    springs = [active for active in effects if active.effect.has("contact")] if _changes_spring(probe, law) else []
+    springs = [active for active in effects if _changes_spring(_touched(impact, law, [active], slip, None), law)]
 
     def numbers(tau: Tensor, zeta: Tensor) -> tuple[Tensor, Tensor]:
         return tau.square().reciprocal(), 2 * zeta / tau
