@@ -8,7 +8,7 @@ of flight, along the motion and across it, by maximum likelihood.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -67,15 +67,20 @@ def with_regular_times(episodes: Sequence[Episode], bodies: Collection[str]) -> 
         f"fast motion follows the clock {stated / regular:.1f} times better: its times are used. Record the times of "
         "the exposures, or write frame number / frame rate as time_s."
     )
-    return [Episode(name, {body: _at_clock(track) for body, track in tracks.items()}) for name, tracks in episodes], (
-        warning,
-    )
+    return [Episode(name, _at_clock(tracks, bodies)) for name, tracks in episodes], (warning,)
 
 
-def _at_clock(track: Track) -> Track:
-    """Return a track at the times of its clock; as it is without one."""
-    clock = _clock(track.time_s)
-    return track if clock is None else replace(track, time_s=clock)
+def _at_clock(tracks: Mapping[str, Track], bodies: Collection[str]) -> dict[str, Track]:
+    """Return tracks of which those of some bodies, and others that were recorded with them, have the times of a clock.
+
+    What has times of its own, as a robot that logs its commands, keeps them.
+    """
+    clocks = [(track.time_s, _clock(track.time_s)) for body, track in tracks.items() if body in bodies]
+    found = dict(tracks)
+    for body, track in tracks.items():
+        clock = next((clock for stated, clock in clocks if np.array_equal(stated, track.time_s)), None)
+        found[body] = track if clock is None else replace(track, time_s=clock)
+    return found
 
 
 def _clock(time_s: np.ndarray) -> np.ndarray | None:

@@ -60,6 +60,17 @@ def test_times_that_scatter_are_put_on_the_clock_that_the_motion_follows(said: S
         assert np.abs(away).max() < 0.5 * JITTER_S and np.ptp(np.diff(away)) < 1e-5
 
 
+def test_what_logs_its_own_times_keeps_them() -> None:
+    made = [
+        Episode(n, t | {"robot": replace(t["ball"], time_s=t["ball"].time_s + 1e-4), "pad": t["ball"]})
+        for n, t in scattered(throws(7, regular))
+    ]
+    (_, tracks), *_ = with_regular_times(made, {"ball"})[0]
+    assert tracks["robot"] is made[0].tracks["robot"]
+    np.testing.assert_array_equal(tracks["pad"].time_s, tracks["ball"].time_s)
+    assert (tracks["ball"].time_s != made[0].tracks["ball"].time_s).any()
+
+
 @pytest.mark.parametrize("bodies", [{"ball"}, {"other"}])
 def test_right_times_stay(bodies: set[str]) -> None:
     """Exposures that scatter, with their own times, are not put on a clock."""
