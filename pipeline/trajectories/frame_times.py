@@ -24,6 +24,10 @@ from .track_noise import MAD_TO_STD, WINDOW, polynomial_residuals, spread
 Array = NDArray[np.float64]
 LIMITS = TRACK_THRESHOLDS.track_noise
 
+IN_PHASE, NEAR = 200, (0.8, 1.25)
+"""Number of frames from which the rate of a clock is found, and the rates that are tried, in usual ones."""
+MOST_DOUBLINGS = 40
+"""Maximum number of times that the frames from which it is known are doubled."""
 CUBIC_FRAMES, DEGREE = 9, 3
 """Frames of a window of flight, and degree of the polynomial that follows it."""
 TRIED_S = np.concatenate(([0.0], np.geomspace(1e-6, 5e-3, 75)))
@@ -83,17 +87,29 @@ def _at_clock(tracks: Mapping[str, Track], bodies: Collection[str]) -> dict[str,
     return found
 
 
-def _clock(time_s: np.ndarray) -> np.ndarray | None:
-    """Return the times (T,) [s] of a regular clock, with frames left out, nearest to given ones; None without one."""
-    steps = np.diff(time_s)
-    if len(steps) < WINDOW:
+def _clock(time_s: Array) -> Array | None:
+    """Return the times (T,) [s] of a regular clock, with frames left out, nearest to given ones; None without one.
+
+    Its rate is the one at which the first frames are most in phase: of single steps, a late frame makes one too long
+    and the next too short, and rounding each to whole frames would miscount them. The fit is then extended.
+    """
+    if len(time_s) <= WINDOW:
         return None
-    frame = np.concatenate(([0.0], np.cumsum(np.rint(steps / np.median(steps)))))
-    for _ in range(2):  # a step that is rounded wrongly moves the clock little
-        step, first = np.polyfit(frame, time_s, 1)
+    known = min(len(time_s), IN_PHASE)
+    some, usual_s = time_s[:known], float(np.median(np.diff(time_s)))
+    rates = np.arange(NEAR[0] / usual_s, NEAR[1] / usual_s, 0.25 / float(some[-1] - some[0]))
+    phases = np.exp(2j * np.pi * rates[:, None] * (some - some[0])).sum(1)
+    best = int(np.abs(phases).argmax())
+    step, first = 1 / rates[best], some[0] + float(np.angle(phases[best])) / (2 * np.pi * rates[best])
+    for _ in range(MOST_DOUBLINGS):
         frame = np.rint((time_s - first) / step)
+        step, first = np.polyfit(frame[:known], time_s[:known], 1)
+        if known == len(time_s):
+            break
+        known = min(2 * known, len(time_s))
+    frame = np.rint((time_s - first) / step)
     clock = first + step * frame
-    return clock if np.diff(frame).min() >= 1 and np.abs(time_s - clock).max() < 0.5 * step else None
+    return clock if np.diff(frame).min() >= 1 else None
 
 
 def _fast_errors(track: Track, times_s: np.ndarray) -> np.ndarray:

@@ -194,6 +194,8 @@ TRACK_NUMERICS = {
         "frame_times.TRIED_S",
         "frame_times.FACTORS",
         "frame_times.BINS",
+        "frame_times.IN_PHASE, NEAR",
+        "frame_times.MOST_DOUBLINGS",
         "frame_times.FAR",
         "correlated_noise.FAR",
         "correlated_noise.ROBUST_SCALE",
