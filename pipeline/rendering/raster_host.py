@@ -36,7 +36,8 @@ def supported(like: Tensor) -> bool:
 def draw(scene: TiledScene) -> TiledImages:
     """Draw a scene by the program."""
     centres = scene.local.reshape(-1, 3)
-    spheres = (centres, scene.scales, scene.opacities, scene.features)
+    log_opacities = scene.opacities.clamp_min(1e-12).log()
+    spheres = (centres, scene.scales, log_opacities, scene.features)
     with torch.no_grad():
         lists = _Lists.of(scene)
     values, alpha, middle = _Composite.apply(*spheres, lists, scene.median)  # type: ignore[misc]
@@ -99,7 +100,7 @@ class _Lists:
         )
 
     def arguments(self, spheres: Sequence[Tensor], members: range) -> list[Tensor | int | float]:
-        """Return the arguments LISTS of the program for spheres (centres, scales, opacities, features)."""
+        """Return the arguments LISTS of the program for spheres (centres, scales, log_opacities, features)."""
         _, scales, _, features = spheres
         tiles, count, pixels = self.tiles, len(self.counts), self.tiles.basis.shape[1]
         tensors = (*spheres, tiles.basis, tiles.rotations, self.frame, self.starts, self.counts, self.places)
@@ -110,9 +111,9 @@ class _Lists:
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, centres: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, lists: _Lists, median: bool
+        ctx: Any, centres: Tensor, scales: Tensor, log_opacities: Tensor, features: Tensor, lists: _Lists, median: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        spheres = (centres, scales, opacities, features)
+        spheres = (centres, scales, log_opacities, features)
         out, left, middle = _composited(*spheres, lists, median, range(len(scales)))
         ctx.save_for_backward(*spheres, out, left)
         ctx.lists = lists
@@ -132,13 +133,19 @@ class _Composite(torch.autograd.Function):
 
 
 def _composited(
-    centres: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, lists: _Lists, median: bool, members: range
+    centres: Tensor,
+    scales: Tensor,
+    log_opacities: Tensor,
+    features: Tensor,
+    lists: _Lists,
+    median: bool,
+    members: range,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return features and depth (T, P, F + 1), transmittance (T, P) and median depth (T, P) of some of the spheres."""
     shape = (len(lists.counts), lists.tiles.basis.shape[1])
     out = features.new_empty(*shape, features.shape[-1] + 1)
     left, middle = features.new_empty(shape), features.new_zeros(shape)
-    given = lists.arguments((centres, scales, opacities, features), members)
+    given = lists.arguments((centres, scales, log_opacities, features), members)
     threads = _threads(len(lists.places) // PAIRS_PER_THREAD)
     single = features.dtype == torch.float32
     _call(single, "composite_forward", threads, *given, out, left, middle if median else None)

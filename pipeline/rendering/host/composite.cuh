@@ -18,7 +18,8 @@ INLINE Number exponential(Number x) {
     Number turns = x * Number(1.4426950408889634);
     int n = (int)(turns + (turns < Number(0) ? Number(-0.5) : Number(0.5)));
     Number whole = (Number)n;
-    Number r = (x - whole * Number(0.693359375)) - whole * Number(-2.12194440054690583e-4), sum = INVERSE_FACTORIALS[TERMS];
+    Number r = (x - whole * Number(0.693359375)) - whole * Number(-2.12194440054690583e-4);  // log(2) in two parts
+    Number sum = INVERSE_FACTORIALS[TERMS];
     for (int k = TERMS - 1; k >= 0; k--) sum = sum * r + INVERSE_FACTORIALS[k];
     Word bits = ((Word)n + EXPONENT_BIAS) << MANTISSA_BITS;
     Number power;
@@ -43,7 +44,7 @@ INLINE Number product(const Number* a, const Number* b) {
 
 struct Lists {  // C cameras, N spheres, M pairs, T tiles, P pixels; K rows of tile frames
     const Number* centres;      // camera axes, (C * N, 3)
-    const Number *scales, *opacities;  // (N)
+    const Number *scales, *log_opacities;  // (N)
     const Number* features;     // (N, channels), or (C * N, channels) where they differ by camera
     const Number* basis;        // monomials (1, x, y, x^2, x y, y^2) / (1 + x^2 + y^2) of the pixels, (K, P, 6)
     const Number* rotations;    // from camera to tile axes, (K, 3, 3)
@@ -53,10 +54,6 @@ struct Lists {  // C cameras, N spheres, M pairs, T tiles, P pixels; K rows of t
     int first_sphere, end_sphere;  // others are not seen
     Number min_alpha, min_transmittance;
 
-    bool asked(int64_t place) const {
-        return place % spheres >= first_sphere && place % spheres < end_sphere;
-    }
-    const Number* color(int64_t place) const { return features + (by_camera ? place : place % spheres) * channels; }
 };
 
 struct Results {  // the last of the channels + 1 of `out` is the depth
@@ -65,28 +62,34 @@ struct Results {  // the last of the channels + 1 of `out` is the depth
 
 struct Gradients {
     const Number *out, *alpha;  // with respect to the results, as those
-    Number* pairs;              // of each pair by centre, scale, opacity and features, (M, 5 + channels)
+    Number* pairs;              // of each pair by centre, scale, logarithm of opacity, features, (M, 5 + channels)
 };
 
 // A sphere in the frame of a tile: its alpha is exp(basis . coefficients). In the frame of a tile, whose z axis is the
 // ray through the tile's centre, the squared distance from a centre p to the ray (x, y, 1) is a quadratic polynomial,
 //     dist^2 (1 + x^2 + y^2) = (px - pz x)^2 + (py - pz y)^2 + (px y - py x)^2        (derived: |p x d|^2 / |d|^2).
 struct Seen {
-    Number x, y, z, k;  // its place, and -1 / (2 scale^2)
+    int64_t sphere;  // its number; negative where it is not asked for
+    const Number* features;
+    Number scale, depth;
+    Number x, y, z, k;  // its place in the frame of the tile, and -1 / (2 scale^2)
     Number coefficients[6];
 };
 
-#define LEAST_OPACITY Number(1e-12)
-
 INLINE Seen seen_from(const Lists& lists, int64_t place, const Number* turn) {
-    const Number* c = lists.centres + 3 * place;
-    Number scale = lists.scales[place % lists.spheres], opacity = lists.opacities[place % lists.spheres];
-    Number log_opacity = std::log(opacity < LEAST_OPACITY ? LEAST_OPACITY : opacity);
     Seen s;
+    int64_t sphere = place % lists.spheres;
+    s.sphere = sphere < lists.first_sphere || sphere >= lists.end_sphere ? -1 : sphere;
+    if (s.sphere < 0) return s;
+    const Number* c = lists.centres + 3 * place;
+    Number log_opacity = lists.log_opacities[sphere];
+    s.features = lists.features + (lists.by_camera ? place : sphere) * lists.channels;
+    s.scale = lists.scales[sphere];
+    s.depth = c[2];
     s.x = turn[0] * c[0] + turn[1] * c[1] + turn[2] * c[2];
     s.y = turn[3] * c[0] + turn[4] * c[1] + turn[5] * c[2];
     s.z = turn[6] * c[0] + turn[7] * c[1] + turn[8] * c[2];
-    s.k = Number(-0.5) / (scale * scale);
+    s.k = Number(-0.5) / (s.scale * s.scale);
     Number kx = s.k * s.x, ky = s.k * s.y, xx = kx * s.x, yy = ky * s.y, zz = s.k * s.z * s.z;
     s.coefficients[0] = xx + yy + log_opacity;
     s.coefficients[1] = Number(-2) * kx * s.z;
@@ -97,18 +100,17 @@ INLINE Seen seen_from(const Lists& lists, int64_t place, const Number* turn) {
     return s;
 }
 
-// Adds the derivatives by centre, scale and opacity to five numbers, from those by the coefficients.
-INLINE void add_slopes(const Lists& lists, int64_t place, const Number* turn, const Seen& s, const Number* g, Number* to) {
-    Number x = s.x, y = s.y, z = s.z, twice = Number(2) * s.k, scale = lists.scales[place % lists.spheres];
+// Adds the derivatives by centre, scale and logarithm of the opacity to five numbers, from those by the coefficients.
+INLINE void add_slopes(const Number* turn, const Seen& s, const Number* g, Number* to) {
+    Number x = s.x, y = s.y, z = s.z, twice = Number(2) * s.k;
     Number by_x = twice * ((g[0] + g[5]) * x - g[1] * z - g[4] * y);
     Number by_y = twice * ((g[0] + g[3]) * y - g[2] * z - g[4] * x);
     Number by_z = twice * ((g[3] + g[5]) * z - g[1] * x - g[2] * y);
     for (int axis = 0; axis < 3; axis++) to[axis] += turn[axis] * by_x + turn[3 + axis] * by_y + turn[6 + axis] * by_z;
     Number by_k = (g[0] + g[5]) * x * x + (g[0] + g[3]) * y * y + (g[3] + g[5]) * z * z -
                   Number(2) * (g[1] * x * z + g[2] * y * z + g[4] * x * y);
-    to[3] += by_k / (scale * scale * scale);
-    Number opacity = lists.opacities[place % lists.spheres];
-    if (opacity >= LEAST_OPACITY) to[4] += (g[0] + g[3] + g[5]) / opacity;
+    to[3] += by_k / (s.scale * s.scale * s.scale);
+    to[4] += g[0] + g[3] + g[5];
 }
 
 // Up to BLOCK pixels of a tile. Those that are missing start with a transmittance of 0, so that nothing is seen there.
@@ -174,16 +176,13 @@ INLINE void forward_block(const Lists& lists, Results& results, int64_t tile, in
     const Number* turn = lists.rotations + 9 * lists.frame[tile];
     for (int64_t i = 0; i < lists.counts[tile] && !finished(lists, block, i); i++) {
         int64_t place = lists.places[lists.starts[tile] + i];
-        if (!lists.asked(place)) continue;
         Seen sphere = seen_from(lists, place, turn);
-        if (!seen(sphere.coefficients, least, block)) continue;
+        if (sphere.sphere < 0 || !seen(sphere.coefficients, least, block)) continue;
         shade(least, block);
-        const Number* color = lists.color(place);
-        Number depth = lists.centres[3 * place + 2];
         if (results.middle) {
             EACH_PIXEL(p) {
                 Number after = block.left[p] - limited(block.alpha[p]) * block.left[p];
-                middle[p] += block.left[p] > Number(0.5) && after <= Number(0.5) ? depth : Number(0);
+                middle[p] += block.left[p] > Number(0.5) && after <= Number(0.5) ? sphere.depth : Number(0);
             }
         }
         EACH_PIXEL(p) {
@@ -192,7 +191,7 @@ INLINE void forward_block(const Lists& lists, Results& results, int64_t tile, in
             block.left[p] *= Number(1) - alpha;
         }
         for (int c = 0; c < width; c++) {
-            Number value = c < lists.channels ? color[c] : depth, *sum = sums + c * BLOCK;
+            Number value = c < lists.channels ? sphere.features[c] : sphere.depth, *sum = sums + c * BLOCK;
             EACH_PIXEL(p) sum[p] += block.weight[p] * value;
         }
     }
@@ -226,15 +225,12 @@ INLINE void backward_block(const Lists& lists, const Results& results, Gradients
     const Number* turn = lists.rotations + 9 * lists.frame[tile];
     for (int64_t i = 0; i < lists.counts[tile] && !finished(lists, block, i); i++) {
         int64_t pair = lists.starts[tile] + i, place = lists.places[pair];
-        if (!lists.asked(place)) continue;
         Seen sphere = seen_from(lists, place, turn);
-        if (!seen(sphere.coefficients, least, block)) continue;
+        if (sphere.sphere < 0 || !seen(sphere.coefficients, least, block)) continue;
         shade(least, block);
-        const Number* color = lists.color(place);
-        Number depth = lists.centres[3 * place + 2];
-        EACH_PIXEL(p) along[p] = depth * by_value[lists.channels * BLOCK + p];
+        EACH_PIXEL(p) along[p] = sphere.depth * by_value[lists.channels * BLOCK + p];
         for (int c = 0; c < lists.channels; c++) {
-            Number value = color[c];
+            Number value = sphere.features[c];
             const Number* by = by_value + c * BLOCK;
             EACH_PIXEL(p) along[p] += by[p] * value;
         }
@@ -249,7 +245,7 @@ INLINE void backward_block(const Lists& lists, const Results& results, Gradients
         }
         Number by_coefficients[6], *to = gradients.pairs + pair * (5 + lists.channels);
         for (int k = 0; k < 6; k++) by_coefficients[k] = product(gradient, block.basis[k]);
-        add_slopes(lists, place, turn, sphere, by_coefficients, to);
+        add_slopes(turn, sphere, by_coefficients, to);
         to[2] += product(block.weight, by_value + lists.channels * BLOCK);
         for (int c = 0; c < lists.channels; c++) to[5 + c] += product(block.weight, by_value + c * BLOCK);
     }
@@ -300,13 +296,13 @@ static void* composite_tiles(void* shared) {
 }
 
 #define LISTS                                                                                                       \
-    const Number *centres, const Number *scales, const Number *opacities, const Number *features,                   \
+    const Number *centres, const Number *scales, const Number *log_opacities, const Number *features,               \
         const Number *basis, const Number *rotations, const int64_t *frame, const int64_t *starts,                  \
         const int64_t *counts, const int64_t *places, int spheres, int tiles, int pixels, int channels,             \
         int by_camera, int first_sphere, int end_sphere, double min_alpha, double min_transmittance
 #define GIVEN                                                                                                       \
     {                                                                                                               \
-        centres, scales, opacities, features, basis, rotations, frame, starts, counts, places, spheres, tiles,      \
+        centres, scales, log_opacities, features, basis, rotations, frame, starts, counts, places, spheres, tiles,  \
             pixels, channels, by_camera, first_sphere, end_sphere, (Number)min_alpha, (Number)min_transmittance     \
     }
 
@@ -317,7 +313,7 @@ extern "C" void composite_forward(int threads, LISTS, Number* out, Number* left,
     in_threads(threads, composite_tiles, &queue);
 }
 
-// Adds to the derivatives by centres (C * N, 3), scales, opacities and features, and the pairs are
+// Adds to the derivatives by centres (C * N, 3), scales, logarithms of opacities and features, and the pairs are
 // added up one after another, so that the sums do not depend on the number of threads.
 extern "C" void composite_backward(int threads, LISTS, Number* out, Number* left, const Number* grad_out,
                                    const Number* grad_alpha, int pairs, Number* by_centre, Number* by_scale,

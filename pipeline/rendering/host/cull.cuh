@@ -99,7 +99,8 @@ void cull_block(const Scene& scene, Found& found, int camera, int block, Room& r
     const Number *axes = scene.axes + scene.kind[camera] * all * 3, *halves = scene.halves + scene.kind[camera] * all;
     int64_t N = scene.spheres;
     const Number* given = scene.cones + camera * 6 * N;
-    Cones cones = {(int)scene.drawn[camera], given, given + N, given + 2 * N, given + 3 * N, given + 4 * N, given + 5 * N};
+    int drawn = (int)scene.drawn[camera];
+    Cones cones = {drawn, given, given + N, given + 2 * N, given + 3 * N, given + 4 * N, given + 5 * N};
     uint8_t* meets = room.meets.values;
     mark(around(axes, halves, tiles, count), cones, meets);
     const Number* near = room.near.values;
