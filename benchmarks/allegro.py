@@ -33,7 +33,7 @@ from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant
 from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
 from cgwm.schemas import ContactParameters, HandTask
-from known_object import known_object
+from known_object import errors_of, known_object
 from store import Store
 
 mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs
@@ -116,7 +116,10 @@ def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
                 "turn_deg": math.degrees(2 * math.acos(math.sqrt(0.96))), "hold_s": 2.1, "drop_m": 0.1, "goals": 1,
                 "timeout_s": 50.0,
             },
-            "plant": {"kind": "mujoco", "scene": str(scene.relative_to(folder)), "body": "obj"},
+            "limits": {"speed_rad_s": given.speed},
+            "plant": {
+                "kind": "mujoco", "scene": str(scene.relative_to(folder)), "body": "obj", **errors_of(given.plant),
+            },
         }
     )  # fmt: skip
     task._source = str(folder / "task.toml")
@@ -169,6 +172,8 @@ def main() -> None:
     parser.add_argument("--corners", type=int, default=32, help="of the hull of the object")
     parser.add_argument("--horizon", type=float, default=0.5)
     parser.add_argument("--step", type=float, default=0.01)
+    parser.add_argument("--speed", type=float, default=2.0, help="limit of targets [rad/s]; theirs: 0.2 rad a command")
+    parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
     parser.add_argument("--lift", type=float, default=0.0, help="height above the start of the repository [m]")
     parser.add_argument("--store", type=Path, default=None)
     parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
@@ -186,6 +191,7 @@ def main() -> None:
             scene = scene_of(given.repository, folder, thing)
             for seed in range(given.first, given.first + given.seeds):
                 size = f"{given.hz:g} Hz, {given.samples} x {given.horizon:g} s in steps of {1e3 * given.step:g} ms"
+                size += f", {given.plant}" if given.plant else ""
                 store.result(f"{thing}, {size}/{seed}", lambda c=scene, s=seed: measure(folder, c, s, given))
 
 

@@ -40,7 +40,7 @@ from cgwm.pipeline.control.horizon import Array
 from cgwm.pipeline.control.solvers import Solution
 from cgwm.schemas import ContactParameters, HandTask, NotConvergedError
 from hand_cem import CemController
-from known_object import known_object
+from known_object import errors_of, known_object
 from numpy.typing import ArrayLike
 from processor_clock import charge_processors
 from store import Store, timed
@@ -93,7 +93,6 @@ def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
     ]
     touching += [(finger[-1], "leap_hand") for finger in fingers]  # what the scene does not exclude, fingers apart
     tips = {f"{finger}_ds/3": TIP_FRICTION for finger in ("if", "mf", "rf", "th")}  # the last part of each
-    errors = {name: float(value) for name, _, value in (one.partition("=") for one in given.plant.split(",") if one)}
     task = HandTask.model_validate(
         {
             "robot": {
@@ -112,7 +111,7 @@ def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
                 "step_s": given.step,
             },
             "success": {"turn_deg": math.degrees(0.4), "drop_m": 0.4, "goals": 20, "timeout_s": given.seconds},
-            "plant": {"kind": "mujoco", "scene": "xml/leap_cube_sim.xml", "body": "cube", **errors},
+            "plant": {"kind": "mujoco", "scene": "xml/leap_cube_sim.xml", "body": "cube", **errors_of(given.plant)},
         }
     )
     task._source = str(folder / "task.toml")

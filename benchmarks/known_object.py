@@ -1,4 +1,4 @@
-"""The model of a convex object whose shape and numbers are known, as benchmarks give it to the planner of a hand."""
+"""What benchmarks of hands share: the model of a convex object whose numbers are known, and errors of the plant."""
 
 from __future__ import annotations
 
@@ -36,3 +36,8 @@ def known_object(
     file = ModelFile(bodies=(body,), contact=contact, provenance=Provenance(capture="none"))
     spheres = Splats(centers, radii / 2, np.full(len(radii), 0.95), np.full((len(radii), 3), 0.5))
     return Model(root=None, file=file, collision={"object": spheres})
+
+
+def errors_of(words: str) -> dict[str, float]:
+    """Return the fields of a plant that words like `friction_factor=0.5,delay_s=0.03` set."""
+    return {name: float(value) for name, _, value in (one.partition("=") for one in words.split(",") if one)}
