@@ -1,7 +1,7 @@
 """A LEAP hand turns a cube to random orientations: the controller of cgwm on the scene of judo-rai.
 
 python benchmarks/hand.py run --scene FOLDER [--first 0] [--seeds 5] [--clock ideal|real|cpu] [--contenders mppi,cem]
-       [--plant friction_factor=0.5] [--limit 300]
+       [--plant friction_factor=0.5] [--model FOLDER] [--limit 300]
 python benchmarks/hand.py table
 
 FOLDER is `judo/models` of the wheel of judo-rai 0.1.0 (MIT; `pip download --no-deps judo-rai==0.1.0`), with the meshes
@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from cgwm.datasets.models.model import Model
+from cgwm.datasets.models.model import Model, read_model
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
@@ -171,11 +171,12 @@ def measure(
 ) -> dict[str, Any]:
     """Return the figures of one run."""
     clock, device = given.clock, given.device
+    model = cube() if given.model is None else read_model(given.model)
     if name == "cem":
-        controller = CemController(cube(), task)
+        controller = CemController(model, task)
     else:
         solver = "mppi" if name == "hold" else name
-        controller = HandController(cube(), task, solver, device=device)  # pyright: ignore[reportArgumentType]
+        controller = HandController(model, task, solver, device=device)  # pyright: ignore[reportArgumentType]
     if name == "hold":
         controller._solver = Hold()
     if clock == "cpu":
@@ -243,6 +244,7 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the predictions")
     parser.add_argument("--store", type=Path, default=None)
     parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
+    parser.add_argument("--model", type=Path, default=None, help="a fitted model of the cube in place of the true one")
     parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
     parser.add_argument("--limit", type=float, default=math.inf, help="wall time after which runs are cut [s]")
     given = parser.parse_args()
@@ -264,6 +266,7 @@ def main() -> None:
                 if time.monotonic() > end_s:
                     return
                 kind = f"{given.device}, {given.plant}" if given.plant else given.device
+                kind += "" if given.model is None else ", fitted"
                 key = f"{name}, {given.clock}, {given.hz:g} Hz, {size}, {kind}/{seed}"
                 known = store.known(key)
                 if known is None or known["ended"] == UNFINISHED:

@@ -32,9 +32,8 @@ def sentence(runs: Sequence[ControlRun], task: AnyTask, clock: ClockName) -> str
     """Return the outcome of runs in words."""
     good = [run for run in runs if run.ended == "success"]
     place = task.success.position_m
-    bars = (
-        f"{task.success.turn_deg:g} deg" if place is None else f"{1e3 * place:g} mm and {task.success.turn_deg:g} deg"
-    )
+    turn = f"{task.success.turn_deg:.3g} deg"
+    bars = turn if place is None else f"{1e3 * place:g} mm and {turn}"
     what = "the goal"
     if isinstance(task, HandTask) and task.success.goals > 1:
         what = f"{task.success.goals} goals in a row"
