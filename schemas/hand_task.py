@@ -47,7 +47,7 @@ class HandSection(TaskSection):
     apart: tuple[str, ...] = ()
     """Links that the object never touches; predictions without their shapes are faster."""
     corners: Annotated[int, Field(ge=4, le=200)] = 24
-    """Largest number of corners of the convex shape of each part of a link."""
+    """Largest number of corners of the convex shape of each part of a link, and of a convex object."""
     touching: tuple[tuple[str, str], ...] = ()
     """Pairs of links of different fingers, or of a finger and the root, that touch each other; others pass through each
     other. A link touches others as the hull of its parts, the root as its parts.

@@ -15,6 +15,7 @@ from ...datasets.models.model import Model
 from ...datasets.robots import Articulation, read_articulation
 from ...schemas import HandTask, InputDataError, require_joints
 from ...schemas.materials import pair_of
+from ..geometry.directions import fibonacci_directions
 from ..physics.articulated import Servo, chain_of
 from ..physics.chain import Chain, Joint
 from ..physics.chain_state import require_touching, with_joints
@@ -22,7 +23,7 @@ from ..physics.checks import require_apart
 from ..physics.contact_law import ContactLaw
 from ..physics.hull import Hull
 from ..physics.world import Body, State, World
-from ..sg_gs.link_hulls import Balls, link_hulls, whole_hull
+from ..sg_gs.link_hulls import Balls, link_hulls, rounded_hull, whole_hull
 from .horizon import Array
 from .task_world import free_object, require_metric, require_rigid, softened
 
@@ -30,6 +31,8 @@ OBJECT, LINK = "the object", "a link"
 """Materials of the object, and prefix of those of links with a friction of their own."""
 WHOLE_CORNERS = 12
 """Largest number of corners of the hulls by which links touch each other."""
+DIRECTIONS = 200
+"""Points of each ball of an object whose hull gets fewer corners."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,6 +263,15 @@ def _with_hull(body: Body, balls: Balls) -> Body:
     return replace(body, centers=centers, radii=radii, on_plane=None, hull=Hull.of(centers[0], radii[0], every))
 
 
+def _with_few_corners(body: Body, corners: int) -> Body:
+    """Return a convex body with the hull of at most `corners` balls: plans pay for each face and edge in every step."""
+    if body.hull is None or body.radii.shape[1] <= corners:
+        return body
+    centers, radii = body.centers[0].numpy(), body.radii[0].numpy()
+    surface = centers[:, None] + radii[:, None, None] * fibonacci_directions(DIRECTIONS)
+    return _with_hull(body, rounded_hull(surface.reshape(-1, 3), corners))
+
+
 def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body]) -> World:
     """Return the world of hand and object, with the law of the model and the frictions that the task gives.
 
@@ -282,7 +294,7 @@ def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body]) 
         for link, value in task.robot.friction.items()
     }
     return World(
-        bodies=(*links, replace(thing, material=OBJECT)),
+        bodies=(*links, replace(_with_few_corners(thing, task.robot.corners), material=OBJECT)),
         gravity=alone.gravity,
         ground_normal=None,
         ground_offset=None,

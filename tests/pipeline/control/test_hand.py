@@ -116,6 +116,19 @@ def test_each_part_of_a_link_is_a_shape_that_may_have_a_friction_of_its_own(fold
         hand_world(model, hand_task(folder, robot=robot | {"friction": {"arm/2": 0.9}}))
 
 
+def test_a_convex_object_of_many_balls_has_as_few_corners_as_a_link(folder: Path, model: Model) -> None:
+    convex = replace(model, file=model.file.model_copy(update={
+        "bodies": tuple(body.model_copy(update={"convex": True}) for body in model.file.bodies)
+    }))  # fmt: skip
+    many, few = (
+        hand_world(convex, hand_task(folder, robot={"corners": count})).world.bodies[-1] for count in (200, 24)
+    )
+    assert many.radii.shape[1] == 27
+    assert few.radii.shape[1] <= 24
+    reach = [(one.centers[0].abs() + one.radii[0][:, None]).amax(0) for one in (many, few)]
+    torch.testing.assert_close(*reach, atol=1e-3, rtol=0)
+
+
 def test_a_link_touches_the_root_as_the_hull_of_its_parts_and_the_object_as_its_parts(
     folder: Path, model: Model
 ) -> None:
