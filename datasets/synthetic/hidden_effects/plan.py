@@ -13,7 +13,17 @@ from .registry import EFFECTS, Size
 from .things import Kind
 
 Stage = Literal[
-    "development", "report", "report2", "report3", "report4", "report5", "report6", "report7", "report8", "report9"
+    "development",
+    "report",
+    "report2",
+    "report3",
+    "report4",
+    "report5",
+    "report6",
+    "report7",
+    "report8",
+    "report9",
+    "report10",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on the first stage alone. Results on a report stage were known when `diagnose` was changed
@@ -29,9 +39,10 @@ afterwards, so that each of these changes has to be judged on a later stage:
 - `report7`: slight effects in flight needed more evidence, correlated errors were modelled, and effects in flight
   became alternatives in captures without flight (2026-11-23);
 - `report8`: a value beyond the plausible size of its parameter counted against an effect, and segments of contact
-  alone needed a larger score (2026-11-26).
+  alone needed a larger score (2026-11-26);
+- `report9`: segments of contact named again what slides rank first, and some effects alone (2026-11-27).
 
-The present version is judged on `report9`."""
+The present version is judged on `report10`."""
 Noise = Literal["spread", "study"]
 
 UNKNOWN = tuple(name for name, entry in EFFECTS.items() if entry.acts == "unknown")
