@@ -83,17 +83,19 @@ class SegmentsTest(ContactTest):
 
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bars of an effect: where slides show it, too, and where segments alone do."""
-        best, shown = equals[0], _first_of_slides(data)
+        best, shown, slides = equals[0], _first_of_slides(data), THRESHOLDS.sliding
         if len(best.candidate.effect.parameters) > self.limits.few_parameters or not repeats(best, 1):
             return ()
-        found = []
-        if shown is not None and shown.name == best.name and shown.score > self.limits.shown_score:
+        if best.name in slides.higher_at_rest and (best.test.estimate < 0).any():
+            return ()
+        found, hidden = [], best.name in (*slides.in_impacts_alone, *slides.as_friction)
+        if shown is not None and shown.name == best.name and shown.score > self.limits.shown_score and not hidden:
             found.append(Bar(score=self.limits.agreed_score, gain_t=self.limits.gain_t))
         alone = dict(self.limits.alone).get(best.name)
         # what is unexplained in flight acts on the ground, too, and the law of a named effect is never exactly true
         clear = data.explained and not data.flown
         if alone is not None and (clear or best.name in self.limits.unlike_laws):
-            found.append(Bar(score=alone, gain_t=self.limits.gain_t))
+            found.append(Bar(score=alone, gain_t=self.limits.alone_t))
         return tuple(found)
 
     def added(self, data: ContactData, best: Evidence) -> tuple[World, Evidence] | None:

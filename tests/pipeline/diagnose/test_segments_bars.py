@@ -47,8 +47,17 @@ def test_an_effect_that_ranks_first_among_slides_needs_less(name: str) -> None:
     assert bars(evidence(name)) == [alone]
     assert bars(evidence(name), sliding=(name,)) == [LIMITS.agreed_score, alone]
     assert LIMITS.agreed_score < alone
-    # nine numbers fit any law
-    assert bars(evidence("friction_patch"), sliding=("friction_patch",)) == []
+    # nine numbers fit any law; slides cannot show a restitution, and follow a pull by friction
+    for other in ("friction_patch", "velocity_restitution", "ground_magnet"):
+        assert bars(evidence(other), sliding=() if other == "ground_magnet" else (other,)) == []
+    assert bars(evidence("adhesion"), sliding=("adhesion",)) == bars(evidence("adhesion")) != []
+
+
+def test_dry_friction_at_rest_is_not_below_that_of_sliding() -> None:
+    one = evidence("stribeck_friction")
+    assert bars(one, sliding=("stribeck_friction",)) != []
+    less = replace(one, test=replace(one.test, estimate=-one.test.estimate))
+    assert bars(less, sliding=("stribeck_friction",)) == []
 
 
 def test_a_torque_about_the_normal_needs_no_slides_and_no_clear_flight() -> None:
