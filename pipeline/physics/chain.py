@@ -174,6 +174,15 @@ class Chain:
     """Links that touch nothing but links of the chain."""
 
     @cached_property
+    def identity(self) -> object:
+        """Token that the chain has in common with its copies on other devices, and with no other chain."""
+        return object()
+
+    def is_copied_as(self, copy: Chain) -> None:
+        """Give a copy on another device or of another type the identity of this chain."""
+        copy.__dict__["identity"] = self.identity
+
+    @cached_property
     def links(self) -> tuple[str, ...]:
         """Names of the links, the root first, then those of the joints in their order."""
         return (self.root, *(joint.link for joint in self.joints))

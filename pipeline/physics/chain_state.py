@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from weakref import ref
 
@@ -150,7 +150,7 @@ def joint_values(names: Sequence[str], state: State, chain: Chain, exact: bool =
         nothing = state.position_m.new_zeros(state.position_m.shape[0], 0)
         return nothing, nothing
     made = _MADE.get(state.position_m)
-    if made is not None and made.chain is chain and made.of(state):
+    if made is not None and made.chain == chain.identity and made.of(state):
         return made.value, made.speed
     rows = [names.index(name) for name in chain.links]
     child, parent = rows[1:], [rows[up] for up in chain.parents[1:]]
@@ -250,16 +250,33 @@ def _posed(
         field[:, rows] = values_
     found = type(state)(*fields)
     if chain.moving and _principal(chain, value):
-        _MADE[found.position_m] = _Made(chain, [(ref(part), part._version) for part in found.tensors], value, speed)
+        _MADE[found.position_m] = _Made(chain.identity, _versions(found), value, speed)
     return found
+
+
+def made_likewise(state: State, copy: State, copied: Callable[[Tensor], Tensor]) -> None:
+    """Keep for a copy of a state the joints from which that was made.
+
+    Args:
+        state: A state.
+        copy: The same on another device or of another type.
+        copied: Function that copies a tensor likewise.
+    """
+    made = _MADE.get(state.position_m)
+    if made is not None and made.of(state) and copy.position_m is not state.position_m:
+        _MADE[copy.position_m] = _Made(made.chain, _versions(copy), copied(made.value), copied(made.speed))
+
+
+def _versions(state: State) -> list[tuple[ref[Tensor], int]]:
+    return [(ref(part), part._version) for part in state.tensors]
 
 
 @dataclass(frozen=True)
 class _Made:
     """Joints from which a state was made, so that they need not be found again from the poses of the links."""
 
-    chain: Chain
-    """Their chain."""
+    chain: object
+    """`Chain.identity` of their chain."""
     tensors: list[tuple[ref[Tensor], int]]
     """The state's tensors and their versions: one that was changed in place makes another state."""
     value: Tensor

@@ -9,6 +9,10 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from .chain import Chain
+from .chain_state import made_likewise
+from .world import State
+
 T = TypeVar("T")
 
 
@@ -34,5 +38,15 @@ def _moved(thing: Any, device: torch.device, dtype: torch.dtype | None) -> Any:
         moved = {f.name: _moved(getattr(thing, f.name), device, dtype) for f in fields(thing)}
         # what has no tensors stays the same object, with what it has computed
         changed = any(value is not getattr(thing, name) for name, value in moved.items())
-        return replace(thing, **moved) if changed else thing
+        return _copied(thing, moved, device, dtype) if changed else thing
     return thing
+
+
+def _copied(thing: Any, fields_: Mapping[str, Any], device: torch.device, dtype: torch.dtype | None) -> Any:
+    copy = replace(thing, **fields_)
+    if isinstance(thing, Chain):
+        thing.is_copied_as(copy)
+    elif isinstance(thing, State):
+        # without it, joints would be found from poses again, by two hundred operations
+        made_likewise(thing, copy, lambda values: _moved(values, device, dtype))
+    return copy

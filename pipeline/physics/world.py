@@ -138,18 +138,20 @@ class World:
             kept[make] = make(self)
         return cast(T, kept[make])
 
-    def latest(self, make: Callable[[World, State, Tensor], T], state: State, times_s: Tensor) -> T:
-        """Return `make(self, state, times_s)`, kept with the world until it is asked for with other objects.
+    def latest(self, make: Callable[..., T], *inputs: State | Tensor) -> T:
+        """Return `make(self, *inputs)`, kept with the world until it is asked for with other objects.
 
-        For callers that simulate one start under several commands. Tensors that were changed in place are others.
+        For callers that simulate one start, or the same times, under several commands. Tensors that were changed in
+        place are others.
         """
         kept: dict[object, object] = self.__dict__.setdefault("_kept", {})
-        versions = [tensor._version for tensor in (*state.tensors, times_s)]
-        found = cast("tuple[State, Tensor, list[int], T] | None", kept.get((World.latest, make)))
-        if found is None or found[0] is not state or found[1] is not times_s or found[2] != versions:
-            found = state, times_s, versions, make(self, state, times_s)
+        parts = [x.tensors if isinstance(x, State) else (x,) for x in inputs]
+        versions = [tensor._version for tensors in parts for tensor in tensors]
+        found = cast("tuple[tuple[State | Tensor, ...], list[int], T] | None", kept.get((World.latest, make)))
+        if found is None or any(a is not b for a, b in zip(found[0], inputs, strict=True)) or found[1] != versions:
+            found = inputs, versions, make(self, *inputs)
             kept[World.latest, make] = found
-        return found[3]
+        return found[2]
 
     @property
     def body_names(self) -> list[str]:

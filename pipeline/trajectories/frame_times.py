@@ -142,9 +142,7 @@ def time_errors(whole: Observations, flight: Sequence[Segment]) -> tuple[float, 
         return 0.0, 0.0
     speed, along, across = (np.concatenate(every) for every in zip(*parts, strict=True))
     time_s, std_m, evidence = _likeliest(speed, along, across)
-    step_s = float(whole.times_s.diff(dim=1).median())
-    seen = evidence > LIMITS.sure_both and time_s > LIMITS.least_jitter * step_s
-    seen &= time_s * float(np.median(speed)) > LIMITS.seen_jitter * std_m
+    seen = evidence > LIMITS.sure_both and time_s * float(np.median(speed)) > LIMITS.seen_jitter * std_m
     return (time_s, std_m) if seen else (0.0, std_m)
 
 

@@ -105,11 +105,7 @@ class TrackNoiseThresholds:
         "measured throws at 300 Hz whose times scatter by 0.3 ms: 0.13",
     )
     least_jitter: float = threshold(
-        0.02,
-        "frames",
-        "scatter of stated times about a regular clock from which the two are compared, and smallest errors of times "
-        "that are said",
-        "real-like development: in 8 of 105 captures with right times smoothed errors look like 0.001 to 0.008 frames",
+        0.01, "frames", "scatter of stated times about a regular clock from which the two are compared", BY_ARGUMENT
     )
     seen_jitter: float = threshold(
         0.5,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from cgwm.pipeline.trajectories.thresholds import NOT_KNOWN
+from cgwm.pipeline.trajectories.thresholds import NOT_KNOWN, Threshold
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -313,13 +313,13 @@ def test_the_page_is_written_from_the_table() -> None:
     assert sorted(cells[0].strip("`") for cells in rows("name")) == sorted(TABLE)
 
 
-def test_what_is_not_known_of_a_threshold_is_said() -> None:
-    for name, one in TABLE.items():
-        assert one.unit and one.decides and one.calibrated_on and one.error_rates, name
-        if one.false_alarms is not None:
-            alarms, nulls = one.false_alarms
-            assert 0 <= alarms < nulls, name
-            assert one.calibrated_on != NOT_KNOWN, name
+@pytest.mark.parametrize("one", TABLE.values(), ids=TABLE)
+def test_what_is_not_known_of_a_threshold_is_said(one: Threshold) -> None:
+    assert one.unit and one.decides and one.calibrated_on and one.error_rates
+    if one.false_alarms is not None:
+        alarms, nulls = one.false_alarms
+        assert 0 <= alarms < nulls
+        assert one.calibrated_on != NOT_KNOWN
 
 
 def test_every_threshold_of_the_table_is_read() -> None:

@@ -48,7 +48,7 @@ class Commands:
 
     def samples(self, like: Tensor) -> Tensor:
         """Return the samples of all commands in one tensor."""
-        return joined([row for row, _ in self.rows]) if self.rows else like.new_zeros(1, 0, 14)
+        return joined([row for row, _ in self.rows]) if self.rows else like.new_zeros(1, 0, tree.COMMAND_WIDTH)
 
     def last(self, like: Tensor) -> Tensor:
         """Return the index of the last interval of each command, int32, shape (1 or B, commands)."""

@@ -22,7 +22,7 @@ from . import tree, wrenches
 from .commands import Commands
 from .layout import in_frame, joined, quat_in_frame, upright
 from .meshes import PackedMeshes, packed_meshes
-from .structure import Structure
+from .structure import SURFACE_WIDTH, Structure
 
 if TYPE_CHECKING:
     from ....datasets.capture.tracks import Track
@@ -126,12 +126,17 @@ def pack(
 def _begun(world: World, state: State, times_s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return `Packed.table` (1 or B, columns), `Packed.steps` and `Packed.substeps`: what no command changes."""
     fixed = world.once(_fixed)
-    times = times_s if times_s.ndim == 2 else times_s[None]
     columns = _columns(world, state, fixed.turn, fixed.structure.turned, fixed.effects)
-    counts = torch.tensor(world.substeps(times), dtype=torch.int32, device=times.device)
     batch = max(map(len, columns))
     table = torch.cat([column.expand(batch, column.shape[-1]) for column in columns], -1)
-    return table, _steps(world.once(wrenches.closed_forms), times, counts), counts
+    return table, *(_paced(world, times_s) if torch.is_inference(times_s) else world.latest(_paced, times_s))
+
+
+def _paced(world: World, times_s: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `Packed.steps` and `Packed.substeps`."""
+    times = times_s if times_s.ndim == 2 else times_s[None]
+    counts = torch.tensor(world.substeps(times), dtype=torch.int32, device=times.device)
+    return _steps(world.once(wrenches.closed_forms), times, counts), counts
 
 
 @dataclass(frozen=True)
@@ -185,7 +190,7 @@ def _fixed(world: World) -> _Fixed:
         turn=turn,
         effects=effects,
         geometry=joined([*map(_spheres, world.bodies), *hulls, *_patch_rows(world)]),
-        surfaces=joined(surfaces) if surfaces else world.gravity.new_zeros(1, 0, 10),
+        surfaces=joined(surfaces) if surfaces else world.gravity.new_zeros(1, 0, SURFACE_WIDTH),
         spheres=listed,
         meshes=meshes,
         structure=_structure(world, effects=bool(effects), turned=turned, lowest=lowest, mesh_starts=meshes.starts),

@@ -22,14 +22,12 @@ from ..rollout import Rollout
 from ..world import State, World
 from .launch import launch, launch_away
 from .packing import Packed, pack, reason_against
-from .structure import Structure, lanes_for
+from .structure import FRAME_WIDTH, LABEL_WIDTH, Structure, lanes_for
 
 if TYPE_CHECKING:
     from ....datasets.capture.tracks import Track
 
 Launch = Callable[[Structure, tuple[Tensor | None, ...], tuple[int, ...]], None]
-
-FRAME_WIDTH, _LABEL_WIDTH = 16, 12
 
 
 def unsupported(world: World) -> str | None:
@@ -107,7 +105,7 @@ def roll(
     structure = replace(structure, dual=dual).on_lanes(chosen)
     frames = values[0].new_empty(batch, count, bodies, FRAME_WIDTH)
     frame_tangents = torch.empty_like(frames) if dual else None
-    labels = values[0].new_empty(batch, count, structure.contacts, _LABEL_WIDTH) if record_contacts else None
+    labels = values[0].new_empty(batch, count, structure.contacts, LABEL_WIDTH) if record_contacts else None
     strides = [0 if x.shape[0] == 1 else x[0].numel() for x in (*values[1:], packed.drive_last)]
     pointers = [x for pair in zip(values, tangents, strict=True) for x in pair]
     pointers += [packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last]

@@ -18,8 +18,8 @@ from .commands import Commands
 from .host import lacking, launch_on_host
 from .launch import launch
 from .packing import Packed, pack
-from .rollout import FRAME_WIDTH, Launch, read_frames, require_one_kind, unsupported
-from .structure import lanes_for
+from .rollout import Launch, read_frames, require_one_kind, unsupported
+from .structure import FRAME_WIDTH, lanes_for
 
 
 class FusedStepper:

@@ -15,7 +15,7 @@ from ..hull import MOST_PLANES, OVERHANG_M, PARALLEL, SAME_NORMAL, SAME_PLANE_M
 from ..impulse_solver import CONTACT_ONSET_M, LEAST_MOBILITY
 from ..joint_rows import LIMIT_TIME_S
 from ..surface_mesh import FLAT, MESH_CONTACTS, ORDER
-from .tree import Tree, listed, listed_copies, lists_bytes
+from .tree import COMMAND_WIDTH, FREE_ROOT, JOINT_COLUMNS, LINK_COLUMNS, Tree, listed, listed_copies, lists_bytes
 
 THREADS = 32
 """Threads of a block: one warp, so that few environments still spread over all multiprocessors."""
@@ -25,6 +25,8 @@ TURN_COLUMNS, WORLD_COLUMNS = 4, 5
 contact law adds one to those of the world."""
 MOTION_COLUMNS = 13
 """Last columns of a body: position, orientation, velocity and spin."""
+FRAME_WIDTH, LABEL_WIDTH, SURFACE_WIDTH = 16, 12, 10
+"""Numbers of a body in a frame, of a contact in a label, and of a fixed surface."""
 SHARED_BYTES = 48 * 1024
 """Shared memory that a block of any CUDA device may have without asking for more."""
 _LONG_LIST = 8
@@ -60,6 +62,13 @@ _NUMBERS: dict[str, float] = {
     "LIMIT_TIME_S": LIMIT_TIME_S,
 }
 """Numbers of the contact engine that the kernels share with torch."""
+
+_WIDTHS = {
+    "BODY_COLUMNS": BODY_COLUMNS, "MOTION_COLUMNS": MOTION_COLUMNS, "LINK_COLUMNS": LINK_COLUMNS,
+    "JOINT_COLUMNS": JOINT_COLUMNS, "SAMPLE_WIDTH": COMMAND_WIDTH, "FRAME_WIDTH": FRAME_WIDTH,
+    "LABEL_WIDTH": LABEL_WIDTH, "SURFACE_WIDTH": SURFACE_WIDTH,
+}  # fmt: skip
+"""Numbers of a row of the kernels' arrays: of 64 bits there, as products with them may need."""
 
 _FILES = (
     "arithmetic",  # dual numbers, vectors and rotations, and sums over the threads of an environment
@@ -157,7 +166,7 @@ class Structure:
         size = (4 if self.single else 8) * (2 if self.dual else 1)
         place, mass = 13 * links, tree.heavy * (16 * links + 2 * dofs + joints)
         kick = mass + max(place, 12 * tree.heavy * links) + 12 * roots + 4 * dofs + joints
-        shown = max(12 * (links + free), (24 + (self.law_count > 1)) * self.lanes)
+        shown = max(12 * (links + free), (28 + (self.law_count > 1)) * self.lanes)
         collide = 6 * tree.columns + shown + 11 * self.lanes + 8 + 2 * pairs
         marks = 2 * pairs + 4 * (bodies + links + free + 4 * self.lanes) + 16
         lasting = 40 + 5 * self.law_count + 41 * bodies + 23 * free + 3 * links + 8 * joints + dofs * (2 + tree.depth)
@@ -221,6 +230,7 @@ class Structure:
         else:
             lists = listed(tree.lists | self._long_lists())
         functions = [_function(name, values) for name, values in self._called_lists().items()]
+        numbers += [f"#define {name} {value}LL" for name, value in _WIDTHS.items()]
         texts = (kernel_file("language"), *lists, *functions, *map(kernel_file, _FILES))
         return "\n".join((*flags, *numbers, *texts))
 
@@ -293,6 +303,7 @@ def _tree_flags(tree: Tree) -> dict[str, int]:
         "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
         "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy, "LEVELS": tree.levels,
         "BRANCH_COUNT": len(tree.branches), "COLUMNS": tree.columns,
+        "FIRST_MOVED": int(bool(tree.kinds) and tree.kinds[0] != FREE_ROOT),
     }  # fmt: skip
 
 

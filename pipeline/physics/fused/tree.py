@@ -21,6 +21,8 @@ LINK_COLUMNS, JOINT_COLUMNS, COMMAND_WIDTH = 20, 9, 14
 """Columns of a link and of a moving joint, as `load_chain` in `kernels/chain.cuh` reads them, and numbers of a row of a
 command: the time of its knot and five coefficients of two joints."""
 _NUMBERS = ("lower", "upper", "stiffness", "damping", "armature", "friction", "torque_limit")
+FREE_ROOT = 1
+"""Kind of a free root, see `Tree.kinds`."""
 _KINDS = {"hinge": 2, "slide": 3, "fixed": 4}
 _SIZES = {"signed char": 1, "short": 2, "int": 4}
 """Types of the numbers of lists that a block of threads copies, and their sizes in bytes."""
@@ -194,7 +196,7 @@ def _append(rows: dict[str, list], world: World, chain: Chain) -> None:
         joint = None if parent < 0 else chain.joints[place - 1]
         kind = int(chain.base == "free") if joint is None else _KINDS[joint.kind]
         before = rows["above"][offset + parent] if parent >= 0 else ()
-        own = 6 if kind == 1 else int(kind in (2, 3))
+        own = 6 if kind == FREE_ROOT else int(kind in (2, 3))
         rows["bodies"].append(names.index(name))
         rows["parents"].append(offset + parent if parent >= 0 else -1)
         rows["kinds"].append(kind)

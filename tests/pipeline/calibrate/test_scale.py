@@ -96,7 +96,7 @@ def test_posed_markers_ignore_false_sightings(world, model):
     assert frame.residual_m < 5e-4
 
 
-@pytest.mark.parametrize("posed", [True, pytest.param(False, marks=pytest.mark.evidence)])
+@pytest.mark.parametrize("posed", [True, False])
 def test_interval_of_the_marker_scale_covers_the_truth(world, model, posed):
     """Over 25 noise draws with the shared edge bias the figure allows for; 2 sigma in at least 85 %."""
     markers = MARKERS if posed else tuple(m.model_copy(update={"pose": None}) for m in MARKERS[:1])

@@ -228,8 +228,6 @@ def test_an_effect_is_rolled_out_and_what_it_would_explain_is_ordered(tmp_path: 
     assert float((force * weight).sum() / weight.sum()) == pytest.approx(0.4, abs=0.1)
 
 
-# In the suite: residuals by body are those of diagnose, driven bodies are in test_eval.py.
-@pytest.mark.evidence
 def test_a_driven_body_and_two_free_ones(tmp_path: Path) -> None:
     """A tip pushes a cube and another one rests: residuals are those of both cubes, by name."""
     root = write_capture(tmp_path / "capture", episodes=1)

@@ -103,7 +103,7 @@ def test_a_plan_that_is_shifted_says_the_same() -> None:
 
 
 @NEEDS_COMPILER
-@pytest.mark.parametrize("name", [pytest.param("gauss-newton", marks=pytest.mark.evidence), "both"])
+@pytest.mark.parametrize("name", ["gauss-newton", "both"])
 def test_a_straight_push_ends_where_the_object_is_wanted(name) -> None:
     """The best push to a goal straight ahead is known: behind the object, by the distance to the goal and the gap."""
     task = push_task(goal={"position_m": [0.02, 0.0]}, limits={"speed_m_s": 0.2})

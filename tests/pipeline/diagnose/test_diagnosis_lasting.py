@@ -85,7 +85,7 @@ def test_innovations_are_what_the_inverse_of_the_covariance_says() -> None:
         assert not found[mask == 0].any()
 
 
-@pytest.mark.parametrize("body", [pytest.param("cube", marks=pytest.mark.evidence), "ball"])
+@pytest.mark.parametrize("body", ["cube", "ball"])
 def test_errors_that_last_are_measured(body: str) -> None:
     prepared, _ = ready(body, {}, lasting(0.7, 3))
     for one, std, true in zip(prepared.noise_model, prepared.noise, NOISE, strict=True):

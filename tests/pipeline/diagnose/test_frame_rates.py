@@ -41,8 +41,6 @@ def test_names_and_numbers_do_not_depend_on_the_frame_rate() -> None:
             assert value == pytest.approx(other, abs=3 * float(np.hypot(std, wider)))
 
 
-# In the suite: the first test of this file, on whole episodes.
-@pytest.mark.evidence
 def test_effects_of_an_earlier_search_stay_where_a_later_one_finds_worse_ones() -> None:
     """Under other errors one effect that imitates two may come first, and end the search."""
     asked, narrow = search(2, CANDIDATES[:2]), search(2, CANDIDATES[2:3])

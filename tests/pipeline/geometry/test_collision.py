@@ -159,7 +159,7 @@ def test_bad_meshes(tmp_path, ellipsoid):
         read_mesh(tmp_path / "bad.obj")
 
 
-@pytest.mark.parametrize("seed", [4, *(pytest.param(seed, marks=pytest.mark.evidence) for seed in (0, 1, 2, 3))])
+@pytest.mark.parametrize("seed", [1, 4, *(pytest.param(seed, marks=pytest.mark.evidence) for seed in (0, 2, 3))])
 def test_boxes_wedges_and_prisms_fill_their_hull_and_blocks_with_a_notch_do_not(seed):
     one = make_object(seed)
     solid = mesh_volume(Mesh(one.vertices, np.asarray(one.faces, np.int64)))

@@ -16,6 +16,7 @@ from cgwm.pipeline.physics.chain_dynamics import ChainDynamics, ChainMotion, _Pl
 from cgwm.pipeline.physics.chain_parameters import chain_parameters
 from cgwm.pipeline.physics.chain_state import joints_of, on_joints, require_chains, with_joints
 from cgwm.pipeline.physics.chain_values import with_chain_values
+from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.joint_command import JointCommand
@@ -513,6 +514,23 @@ def test_a_link_off_its_joint_by_more_than_rounding_is_refused(shift: float, tur
     state.quat_wxyz[:, 1] = quat_multiply(state.quat_wxyz[:, 1], half)
     with pytest.raises(InputDataError, match="off its joint 'first'"):
         joints_of(world, state, chain)
+
+
+def test_joints_go_with_a_state_to_another_device_or_type_and_to_no_other_chain() -> None:
+    chain, bodies = double_pendulum()
+    world = chained(chain, *bodies)
+    state = with_joints(world, still(3), {"first": 0.2, "second": -0.3}, {"first": 0.1})
+    single, there = on_device(world, "cpu", torch.float32), on_device(state, "cpu", torch.float32)
+    values, speeds = joints_of(single, there, single.chains[0])
+    assert values.tolist() == [torch.tensor([0.2, -0.3]).tolist()]  # from poses, they are off by rounding
+    assert speeds.tolist() == [torch.tensor([0.1, 0.0]).tolist()]
+    moved = replace(chain.joints[1], position=chain.joints[1].position + 1e-4)
+    other = replace(chain, joints=(chain.joints[0], moved))
+    with pytest.raises(InputDataError, match="off its joint"):
+        joints_of(replace(single, chains=(on_device(other, "cpu", torch.float32),)), there, other)
+    there.position_m[:, 2] += 1e-4
+    with pytest.raises(InputDataError, match="off its joint"):
+        joints_of(single, there, single.chains[0])
 
 
 def test_priors_of_a_chain_scale_with_its_weight_and_factors_are_as_free_upwards_as_downwards() -> None:

@@ -133,8 +133,6 @@ def test_a_ball_rolls_down_a_groove_at_the_analytic_acceleration(kind: str) -> N
     assert float(found.position_m[0, -1, 0] @ down) > 0.9
 
 
-# In the suite: labels are held to momentum on the ground in test_validate.py.
-@pytest.mark.evidence
 def test_momentum_labels_hold_in_a_box_of_walls() -> None:
     """The impulses of the contacts, with that of gravity, are the change of momentum."""
     vertices, faces = fixed.groove(0.2, 4)

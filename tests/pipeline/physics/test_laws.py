@@ -358,8 +358,6 @@ def test_bodies_rest_within_a_tenth_of_a_millimetre(duration_s: float) -> None:
     assert bool((rollout.position_m[:2, -1, 0, 2] + torch.tensor(low[:2]) > -2 * G * 0.005**2).all())
 
 
-# In the suite: bodies rest within a tenth of a millimetre, and two cubes on each other in test_fused.py.
-@pytest.mark.evidence
 @pytest.mark.parametrize("duration_s", [3.0, pytest.param(10.0, marks=pytest.mark.evidence)])
 def test_three_cubes_stand_on_each_other(duration_s: float) -> None:
     """Cubes of 32 spheres each, touched by their hulls: no drift above 0.01 mm, no motion above 0.1 mm/s after 1 s."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.segments.carried_starts import Beginning, _shape, _step, carried_starts
+from cgwm.pipeline.segments.carried_starts import carried_starts
 from cgwm.pipeline.segments.release_detection import find_releases
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -54,30 +54,3 @@ def test_what_acts_all_along_the_flight_carries_nothing(effects: Mapping[str, Ma
 def test_a_step_down_is_the_rounded_beginning_of_an_impact() -> None:
     world = world_with("ball")
     assert carried_starts(world, whole_episodes(world, carried(thrown(), -20.0 * UP)), NOISE) == {}
-
-
-def test_a_rounded_step_is_the_step_smoothed_by_a_normal_density() -> None:
-    before, width = np.array([-0.03, -0.004, 0.0, 0.006, 0.05]), 0.01
-    offsets = np.linspace(-8, 8, 4001) * width
-    density = np.exp(-0.5 * (offsets / width) ** 2)
-    smoothed = (0.5 * (before[:, None] - offsets).clip(0) ** 2) @ density / density.sum()
-    np.testing.assert_allclose(_shape(before, width), smoothed, rtol=1e-5, atol=1e-12)
-    np.testing.assert_allclose(_shape(before, 1e-9), _shape(before, 0.0), atol=1e-15)
-
-
-@pytest.mark.parametrize("width_s", [0.0, 0.004])
-def test_a_step_of_acceleration_is_found_exactly_where_nothing_else_moves(width_s: float) -> None:
-    times, added = np.arange(40) / RATE_HZ, np.array([3.0, -2.0, 14.0])
-    flight = np.array([0.1, 0.2, 1.0]) + times[:, None] * [1.0, 0.5, 2.0] - 0.5 * 9.81 * times[:, None] ** 2 * UP
-    places = flight + _shape(times[HELD_FRAMES] - times, width_s)[:, None] * added
-    one = Beginning(episode=0, frames=np.arange(40), times_s=times, places_m=places, airborne=True, up=UP)
-    step = _step(one, width_s)
-    assert step.release_s == times[HELD_FRAMES]
-    assert step.size_m_s2 == pytest.approx(np.linalg.norm(added), rel=1e-9)
-    np.testing.assert_allclose(step.residual_m, 0.0, atol=1e-12)
-    # that of a least-squares fit beside a parabola, for errors of 1 m
-    shape = _shape(times[HELD_FRAMES] - times, width_s)
-    columns = np.column_stack([np.vander(times, 3), shape])
-    assert step.known_m_s2 == pytest.approx(np.sqrt(np.linalg.inv(columns.T @ columns)[3, 3]), rel=1e-6)
-    nothing = _step(replace(one, places_m=flight), width_s)
-    assert nothing.size_m_s2 < 1e-9

@@ -61,7 +61,7 @@ ADAPTIVE = {"spheres": 250, "adaptive_iterations": 120, "sh_degree": 1}
 @pytest.mark.parametrize("settings", [{}, pytest.param(ADAPTIVE, marks=pytest.mark.evidence)])
 def test_a_resumed_fit_gives_the_same_spheres(tmp_path, capture, settings, monkeypatch):
     brief = {"iterations": 12, "joint": False, "max_scene_spheres": 100, "bare_ground": False}
-    brief |= {"image_size": 48, "max_body_spheres": 80, "max_collision_spheres": 12, "flat_faces": False}
+    brief |= {"image_size": 48, "max_body_spheres": 80, "max_collision_spheres": 20, "flat_faces": False}
     config = CONFIG.model_copy(update={**brief, **settings})
     monkeypatch.setattr(mcmc, "REFINED_EVERY", 10)
     monkeypatch.setattr(bodies, "refine", unrefined)

@@ -1,3 +1,4 @@
+// Numbers (values, or values with derivatives), vectors, rotations, and exchanges between the threads of an environment.
 #define FULL 0xffffffffu
 #if SINGLE
 typedef float Number;
@@ -21,13 +22,35 @@ inline float root(float x) { return sqrtf(x); }
 inline void sine_cosine(float x, float& s, float& c) { s = sinf(x); c = cosf(x); }
 inline void sine_cosine(double x, double& s, double& c) { s = sin(x); c = cos(x); }
 #else
-// accurate to 2 units in the last place; the exact functions branch and take ten times as long
-__device__ inline float reciprocal(float x) { return __fdividef(1.0f, x); }
-__device__ inline float inverse_root(float x) { return rsqrtf(x); }
+// Accurate to 2 units in the last place, and one instruction each: the exact functions branch and take ten times as long,
+// and those that scale numbers below 1e-38 (`.ftz` takes them as 0) are eight instructions, of which there are hundreds.
+__device__ inline float reciprocal(float x) {
+    float y;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+}
+__device__ inline float inverse_root(float x) {
+    float y;
+    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+}
 __device__ inline double inverse_root(double x) { return rsqrt(x); }
-__device__ inline float root(float x) { return x > 0.0f ? x * rsqrtf(x) : 0.0f; }
+__device__ inline float root(float x) {  // 0 of negative numbers
+    float y;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(fmaxf(x, 0.0f)));
+    return y;
+}
 __device__ inline void sine_cosine(float x, float& s, float& c) { s = __sinf(x); c = __cosf(x); }
 __device__ inline void sine_cosine(double x, double& s, double& c) { sincos(x, &s, &c); }
+#endif
+
+// A quotient. In single precision on a GPU, even one exact division in a kernel is a call, for which a tenth of the code is
+// added around it.
+__device__ inline double quotient(double a, double b) { return a / b; }
+#if HOST
+inline float quotient(float a, float b) { return a / b; }
+#else
+__device__ inline float quotient(float a, float b) { return a * reciprocal(b); }
 #endif
 
 // A value and its directional derivative (dual number): the same source computes values and forward derivatives.

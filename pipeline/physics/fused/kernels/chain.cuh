@@ -1,3 +1,4 @@
+// What is known of chains, and the memory in which the lanes of an environment work on them together.
 #if LINKS
 // Links of chains, joined in trees: numbers of each environment, in the order in which they are read from the table.
 // The lists of the structure: link_body, link_parent (-1: root), link_kind (0: root that is fixed or driven, 1: free
@@ -100,6 +101,7 @@ const int WAITING = 4 * LANES;
 struct QueueRoom {  // where lanes leave slots of which another lane makes the contact
     int slots[WAITING];
     Vec before[WAITING];  // its impulse in the previous step
+    Nearness known[WAITING];  // of its sphere's centre and the other body
 };
 
 struct MoveRoom {  // where lanes leave contacts for other lanes
@@ -179,8 +181,8 @@ INLINE Servo servo_at(const Input& table, long long at) {
 }
 
 #if SHARED
-INLINE Joint Joints::operator[](int l) const { return joint_at(table, first + 20LL * l); }
-INLINE Servo Servos::operator[](int j) const { return servo_at(table, first + 9LL * j); }
+INLINE Joint Joints::operator[](int l) const { return joint_at(table, first + LINK_COLUMNS * l); }
+INLINE Servo Servos::operator[](int j) const { return servo_at(table, first + JOINT_COLUMNS * j); }
 #endif
 
 // Reads the chains from the column `first` of the table on, and returns the column after them.
@@ -188,16 +190,16 @@ INLINE long long load_chain(const Input& table, long long first, const Lanes& la
 #if SHARED
     if (lanes.writes()) {
         Joints joints = {table, first};
-        Servos servos = {table, first + 20 * LINKS};
+        Servos servos = {table, first + LINK_COLUMNS * LINKS};
         chain.joints = joints;
         chain.servos = servos;
     }
 #else
-    for (int l = 0; l < LINKS; l++) chain.joints[l] = joint_at(table, first + 20 * l);
+    for (int l = 0; l < LINKS; l++) chain.joints[l] = joint_at(table, first + LINK_COLUMNS * l);
 #endif
-    first += 20 * LINKS;
+    first += LINK_COLUMNS * LINKS;
     DIVIDED(lanes, k, JOINTS) {
-        long long at = first + 9 * k;
+        long long at = first + JOINT_COLUMNS * k;
         Servo s = servo_at(table, at);
 #if !SHARED
         chain.servos[k] = s;
@@ -208,6 +210,6 @@ INLINE long long load_chain(const Input& table, long long first, const Lanes& la
         chain.acts[k] = plain(s.lower) > Number(-1e30) || plain(s.upper) < Number(1e30) || plain(s.friction) > Number(0);
     }
     for (int c = 0; c < CHAINS; c++) chain.cursors[c] = 0;
-    return first + 9 * JOINTS;
+    return first + JOINT_COLUMNS * JOINTS;
 }
 #endif

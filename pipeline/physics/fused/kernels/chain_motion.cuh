@@ -1,3 +1,5 @@
+// How chains move: poses of links, equations of motion (composite bodies, recursive Newton-Euler), servos, limits and dry
+// friction of joints; formulas of `physics/chain_dynamics.py` and `physics/joint_rows.py`.
 #if LINKS
 INLINE Vec rotated(Quat q, Vec v) {
     Vec axis = vec(q.x, q.y, q.z), twice = Number(2) * cross(axis, v);
@@ -6,7 +8,7 @@ INLINE Vec rotated(Quat q, Vec v) {
 
 // Poses of the links of all chains from those of the roots and the joints' values.
 INLINE void place_links(const Chain& chain, const Lanes& lanes, const Real* values, Vec* positions, Quat* quats) {
-    DIVIDED(lanes, l, LINKS) {  // each in its parent's frame
+    MOVED_LINKS(lanes, l) {  // each in its parent's frame
         int kind = link_kind[l];
         if (link_parent[l] < 0) continue;
         const Joint j = chain.joints[l];
@@ -50,7 +52,7 @@ INLINE Spatial column_of(const Configuration& at, int dof) {
 
 INLINE void configure(const Chain& chain, const Lanes& lanes, const Vec* positions, const Quat* quats,
                       Configuration& at) {
-    DIVIDED(lanes, l, LINKS) {
+    MOVED_LINKS(lanes, l) {
         const Joint j = chain.joints[l];
         Vec origin = positions[l] - positions[link_root[l]];
         Mat R = matrix(quats[l]);
@@ -80,7 +82,7 @@ INLINE void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, 
     ROOM(Real, mass, LINKS, chain.room.kick.mass);
     ROOM(Vec, moment, LINKS, chain.room.kick.mass);
     ROOM(Sym, inertia, LINKS, chain.room.kick.mass);
-    DIVIDED(lanes, l, LINKS) {
+    MOVED_LINKS(lanes, l) {
         if (link_light[l]) continue;
         Vec c = at.coms[l];
         mass[l] = at.masses[l];
@@ -94,6 +96,7 @@ INLINE void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, 
     }
     lanes.sync();
     UP_LINKS(lanes, parent) {
+        if (parent < FIRST_MOVED) continue;
         Sym& to = inertia[parent];
         INNER for (int i = child_start[parent]; i < child_start[parent + 1]; i++) {
             int l = link_child[i];
@@ -168,7 +171,7 @@ INLINE void bias_of(Environment& env, const Lanes& lanes, const Configuration& a
             }
         }
     }
-    DIVIDED(lanes, l, LINKS) {
+    MOVED_LINKS(lanes, l) {
         if (link_light[l]) continue;
         Spatial P = momentum(at, l, velocity[l]), F = momentum(at, l, change[l]);
         Vec w = velocity[l].turning, v = velocity[l].moving;
@@ -183,7 +186,7 @@ INLINE void bias_of(Environment& env, const Lanes& lanes, const Configuration& a
     lanes.sync();
     UP_LINKS(lanes, l) {
         int dof = link_dof[l];
-        if (link_light[l]) continue;
+        if (link_light[l] || l < FIRST_MOVED) continue;
         Spatial& all = force_on[l];
         INNER for (int i = child_start[l]; i < child_start[l + 1]; i++) {
             if (link_light[link_child[i]]) continue;
@@ -221,7 +224,7 @@ INLINE void factor(const Lanes& lanes, Real* A) {
         Real* row = A + d * DEPTH;
         INNER for (int k = 0; k < last; k++) {
             Real sum = Real(0);
-            SOME for (int i = k; i < last; i++) sum += row[i] * A[dof_above[d * DEPTH + i] * DEPTH + k];
+            INNER for (int i = k; i < last; i++) sum += row[i] * A[dof_above[d * DEPTH + i] * DEPTH + k];
             row[k] = -(row[last] * sum);
         }
     }
@@ -234,7 +237,7 @@ INLINE void solve_mass(Chain& chain, const Lanes& lanes, const Real* b, Real* x)
     DIVIDED(lanes, d, DOFS) {
         int last = dof_depth[d] - 1;
         Real sum = inverse[d * DEPTH + last] * b[d];
-        SOME for (int i = below_start[d]; i < below_start[d + 1]; i++) {
+        INNER for (int i = below_start[d]; i < below_start[d + 1]; i++) {
             sum += inverse[dof_below[i] * DEPTH + last] * b[dof_below[i]];
         }
         y[d] = sum;
@@ -248,38 +251,42 @@ INLINE void solve_mass(Chain& chain, const Lanes& lanes, const Real* b, Real* x)
     lanes.sync();
 }
 
-// Target of a joint at a time, from the pieces of its chain's command: rows of 14 numbers, each with the time of the
+// Target of a joint at a time, from the pieces of its chain's command: rows of SAMPLE_WIDTH numbers, each with the time of the
 // knot and the coefficients of two joints.
 INLINE Real target_of(const Problem& problem, const Environment& env, int c, int joint, Real time) {
     int number = chain_command[c], rows = (chain_joints[c] + 1) / 2;
-    long long start = env.drives + 14LL * problem.drive_starts[number];
+    long long start = env.drives + SAMPLE_WIDTH * problem.drive_starts[number];
     const Input& input = problem.drives;
-    long long at = start + 14LL * rows * env.chain.cursors[c];
+    long long at = start + SAMPLE_WIDTH * rows * env.chain.cursors[c];
     Real since = at_least(time - input.at(at), Number(0));
-    at += 14LL * (joint / 2) + 1 + 5 * (joint % 2);
+    at += SAMPLE_WIDTH * (joint / 2) + 1 + 5 * (joint % 2);
     Real value = input.at(at + 4);
     INNER for (int k = 3; k >= 0; k--) value = value * since + input.at(at + k);
     return value;
 }
 
-// Speed that a limit of a joint asks for, as `prepare` does for a contact.
+// Speed that a limit of a joint asks for, as `prepare` does for a contact; -1e30 where the joint does not reach it.
 INLINE Real limit_target(Real gap, Real speed, Real h, Real stiffness, Real damping) {
-    Real ahead = gap + h * speed;
-    if (!(plain(gap) < Number(0) || plain(ahead) < Number(0))) return Real(Number(-1e30));
-    Real closed = Real(1);
-    if (plain(gap) > Number(0)) {
-        Real way = h * (plain(speed) < Number(0) ? -speed : speed);
-        closed = at_most(at_least(-ahead * reciprocal(at_least(way, Number(1e-12))), Number(0)), Number(1));
-    }
-    return speed - damping * closed * speed - stiffness * at_most(ahead, Number(0)) * reciprocal(h);
+    if (!(plain(gap) < Number(0) || plain(gap + h * speed) < Number(0))) return Real(Number(-1e30));
+    return wanted_speed(gap, speed, h, reciprocal(h), stiffness, damping);
 }
 
 // Moves on in the command of a chain to the piece of a time.
 INLINE void seek(const Problem& problem, Environment& env, int c, Real time) {
     int number = chain_command[c], rows = (chain_joints[c] + 1) / 2, last = problem.drive_last[env.drive_last + number];
-    long long start = env.drives + 14LL * problem.drive_starts[number];
+    long long start = env.drives + SAMPLE_WIDTH * problem.drive_starts[number];
     int& cursor = env.chain.cursors[c];
-    while (cursor < last && problem.drives.value[start + 14LL * rows * (cursor + 1)] <= plain(time)) cursor++;
+    while (cursor < last && problem.drives.value[start + SAMPLE_WIDTH * rows * (cursor + 1)] <= plain(time)) cursor++;
+}
+
+// Sets the velocities of a link in a step, in which no contact is known to move it yet.
+INLINE void carry(const Chain& chain, int l, Vec linear, Vec angular, Motion& motion) {
+    motion.velocity = linear;
+    motion.omega = angular;
+#if !SHARED
+    motion.columns = chain.columns + l * DEPTH;
+    motion.depth = 0;
+#endif
 }
 
 // Generalised velocity of the chains after the forces of a step, without contact, and the roots of A; then the
@@ -367,7 +374,7 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
     DIVIDED(lanes, d, DOFS) {
         int last = dof_depth[d] - 1;
         EACH_ABOVE(k, last + 1) kept[d] += A[d * DEPTH + k] * first[dof_above[d * DEPTH + k]];
-        SOME for (int i = below_start[d]; i < below_start[d + 1]; i++) {
+        INNER for (int i = below_start[d]; i < below_start[d + 1]; i++) {
             kept[d] += A[dof_below[i] * DEPTH + last] * first[dof_below[i]];
         }
     }
@@ -394,30 +401,24 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
     solve_mass(chain, lanes, kept, chain.speed);
 #endif
     // the links at the start of the step, with the velocities without contact
-    DIVIDED(lanes, l, LINKS) {
-        int b = link_body[l];
-        positions[l] = env.bodies[b].position;
-        chain.axes[l] = rotations[b] * chain.joints[l].axis;
+    MOVED_LINKS(lanes, l) {
+        positions[l] = env.bodies[link_body[l]].position;
+        chain.axes[l] = rotations[link_body[l]] * chain.joints[l].axis;
         chain.known[l] = false;
     }
     ROOM(Real, moving, JOINTS + 1, chain.room.kick);
     DIVIDED(lanes, j, JOINTS) moving[j] = chain.speed[joint_dof[j]];
     DIVIDED(lanes, c, CHAINS) {
-        int l = chain_root[c], d = link_dof[l];
+        int l = chain_root[c], b = link_body[l], d = link_dof[l];
+        positions[l] = env.bodies[b].position;
         linear[l] = d < 0 ? root_linear[c] : vec(chain.speed[d], chain.speed[d + 1], chain.speed[d + 2]);
         angular[l] = d < 0 ? root_angular[c] : vec(chain.speed[d + 3], chain.speed[d + 4], chain.speed[d + 5]);
+        chain.known[l] = false;
+        carry(chain, l, linear[l], angular[l], motions[b]);
     }
     lanes.sync();
     move_links(lanes, chain.axes, positions, moving, linear, angular);
-    DIVIDED(lanes, l, LINKS) {
-        int b = link_body[l];
-        motions[b].velocity = linear[l];
-        motions[b].omega = angular[l];
-#if !SHARED
-        motions[b].columns = chain.columns + l * DEPTH;
-        motions[b].depth = 0;
-#endif
-    }
+    MOVED_LINKS(lanes, l) carry(chain, l, linear[l], angular[l], motions[link_body[l]]);
     DIVIDED(lanes, d, DOFS) chain.moved[d] = Real(0);
     // limits: critically damped, with a natural time of LIMIT_TIME_S; see `coefficients`
     Real eta = Number(1 / LIMIT_TIME_S) * h, decay = exponential(-eta), twice = decay * decay;
@@ -491,11 +492,11 @@ INLINE void push_chains(Chain& chain, const Lanes& lanes) {
         const int last = dof_depth[d] - 1;
         Real sum = chain.active ? chain.inverse[d * DEPTH + last] * joint_impulse(chain, d) : Real(0);
         if (chain.active) {
-            SOME for (int i = below_start[d]; i < below_start[d + 1]; i++) {
+            INNER for (int i = below_start[d]; i < below_start[d + 1]; i++) {
                 sum += chain.inverse[dof_below[i] * DEPTH + last] * joint_impulse(chain, dof_below[i]);
             }
         }
-        SOME for (int i = moved_start[d]; i < moved_start[d + 1]; i++) {
+        INNER for (int i = moved_start[d]; i < moved_start[d + 1]; i++) {
             const int l = moved_link[i];
             if (!chain.known[l]) continue;
             const Column& column = room.columns[column_start[l] + last];
@@ -615,10 +616,10 @@ INLINE void spread(Environment& env, const Lanes& lanes) {
     }
     lanes.sync();
     place_links(chain, lanes, chain.values, positions, quats);
-    DIVIDED(lanes, l, LINKS) axes[l] = rotated(quats[l], chain.joints[l].axis);
+    MOVED_LINKS(lanes, l) axes[l] = rotated(quats[l], chain.joints[l].axis);
     lanes.sync();
     move_links(lanes, axes, positions, chain.speeds, linear, angular);
-    DIVIDED(lanes, l, LINKS) {
+    MOVED_LINKS(lanes, l) {
         Body& body = env.bodies[link_body[l]];
         body.position = positions[l];
         body.quat = quats[l];

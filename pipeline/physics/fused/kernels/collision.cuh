@@ -1,3 +1,5 @@
+// All contacts of a step: flight before them, which ones there are, and their impulses by projected Gauss-Seidel;
+// formulas of `physics/rigid_body.py`, `physics/contact_detection.py` and `physics/impulse_solver.py`.
 // Moves a free body over one step, given velocity and angular momentum at its end: the position is advanced by the mean
 // velocity, the rotation by the angular velocity of the mean angular momentum at the midpoint.
 INLINE void advance(Body& body, const Weight& c, Vec omega_start, Vec velocity, Vec spin, Real h) {
@@ -364,9 +366,10 @@ __device__ bool face_edges(const Problem& problem, const Environment& env, int p
 #endif
 
 // Finds gap, normal and point of one slot of a pair of bodies: first come the spheres of b against the union of a, then
-// those of a against the union of b, then edges. Returns false if the gap exceeds `limit`.
+// those of a against the union of b, then edges. Returns false if the gap exceeds `limit`. `known` is what is known of the
+// sphere's centre and the other body, if that was sought before.
 __device__ bool face(const Problem& problem, const Environment& env, int p, int k, const Mat* rotations, Number limit,
-                     const Parting& parting, Facing& facing) {
+                     const Parting& parting, const Nearness* known, Facing& facing) {
 #if HULLS
     int spheres_in_all = sphere_count(pair_a(p)) + sphere_count(pair_b(p));
     if (k >= spheres_in_all) {
@@ -388,7 +391,7 @@ __device__ bool face(const Problem& problem, const Environment& env, int p, int 
     Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(other), sphere_count(other)};
     Vec local = transposed(rotations[other], center - position) + env.constants[other].com, outward;
     Real distance;
-    Number nearest;
+    Number nearest = Number(0);
     Number reached = limit + plain(radius);
 #if HULLS
     if (face_count(other) > 0) {
@@ -398,7 +401,7 @@ __device__ bool face(const Problem& problem, const Environment& env, int p, int 
 #endif
     {
         up = transposed(rotations[other], up);
-        if (!union_distance(spheres, local, reached, up, distance, nearest, outward)) return false;
+        if (!union_distance(spheres, local, reached, up, known, distance, nearest, outward)) return false;
     }
     outward = rotations[other] * outward;
     facing.gap = distance - radius;
@@ -474,26 +477,29 @@ INLINE bool may_touch(const Environment& env, int p, const Mat* rotations, const
     reach.near = Number(1e-9 + SMOOTHING_M) + h * (size(ma.velocity - mb.velocity) + size(ma.omega) * ca.reach +
                                                    size(mb.omega) * cb.reach);
     Number left = Number(1) - Number(0.5) * h * spins;
-    reach.limit = left > Number(0.01) ? h * V / left + Number(1e-6) : Number(1e30);
+    reach.limit = left > Number(0.01) ? quotient(h * V, left) + Number(1e-6) : Number(1e30);
     Number apart = size(env.bodies[a].position - env.bodies[b].position);
     if (!(apart - ca.reach - cb.reach - Number(SMOOTHING_M) < reach.limit)) return false;
-    reach.frames[0] = frame_in(env, b, a, rotations);
-    reach.frames[1] = frame_in(env, a, b, rotations);
     const Number margin = Number(1 + 1e-5) * (reach.limit + Number(SMOOTHING_M));
-    return !boxes_apart(cb, ca, reach.frames[0], margin) && !boxes_apart(ca, cb, reach.frames[1], margin);
+    INNER
+    for (int side = 0; side < 2; side++) {
+        reach.frames[side] = frame_in(env, side ? a : b, side ? b : a, rotations);
+        if (boxes_apart(side ? ca : cb, side ? cb : ca, reach.frames[side], margin)) return false;
+    }
+    return true;
 }
 
 // Makes the contact of slot `k` of a pair of bodies: 2 where it touches, 1 where it just opened, whose impulse of the
 // previous step acts until the first iteration, 0 for none.
 INLINE int make_contact(const Problem& problem, const Environment& env, bool warm, Vec before, int p, int k,
                         const Mat* rotations, const Motion* motions, Number limit, Number near, const Parting& parting,
-                        Contact& c, Real& weight) {
+                        const Nearness* known, Contact& c, Real& weight) {
     int a = pair_a(p), b = pair_b(p), found = 2;
 #if !LINKS
     const Motion &ma = motions[a], &mb = motions[b];
 #endif
     Facing facing;
-    if (!face(problem, env, p, k, rotations, limit, parting, facing)) return 0;
+    if (!face(problem, env, p, k, rotations, limit, parting, known, facing)) return 0;
     c.normal = facing.normal;
     c.arm = facing.point - env.bodies[a].position;
     c.arm_b = facing.point - env.bodies[b].position;
@@ -503,8 +509,10 @@ INLINE int make_contact(const Problem& problem, const Environment& env, bool war
     Real speed = dot(relative_velocity(c, motions), c.normal);
 #if LINKS
     Real inverse_mass = Real(0), mobility = Real(0);
-    add_mobility(response(RESPONSES(env, motions), a), c.arm, c.normal, inverse_mass, mobility);
-    add_mobility(response(RESPONSES(env, motions), b), c.arm_b, c.normal, inverse_mass, mobility);
+    INNER
+    for (int side = 0; side < 2; side++) {
+        add_mobility(response(RESPONSES(env, motions), side ? b : a), side ? c.arm_b : c.arm, c.normal, inverse_mass, mobility);
+    }
 #else
     Vec turn_a = cross(c.arm, c.normal), turn_b = cross(c.arm_b, c.normal);
     Real inverse_mass = ma.inverse_mass + dot(turn_a, ma.inverse_inertia * turn_a) + mb.inverse_mass +
@@ -540,12 +548,11 @@ INLINE void queue_pair(const Problem& problem, const Environment& env, const Own
                        Candidates& queue) {
     int a = pair_a(p), b = pair_b(p), start = contact_start(p);
     const CollideRoom& room = env.chain.room.collide;
-    if (!room.near[p]) return;
     const Number limit = room.limits[p];
     const int spheres_of_b = sphere_count(b);
     KEEP_LOOP
     for (int second = 0; second < 2; second++) {  // spheres of b, then those of a
-        const Frame frame = second ? frame_in(env, a, b, rotations) : frame_in(env, b, a, rotations);
+        const Frame frame = frame_in(env, second ? a : b, second ? b : a, rotations);
         const Constants& other = env.constants[second ? b : a];
         const int first = start + (second ? spheres_of_b : 0), count = sphere_count(second ? a : b);
         const bool longer = sphere_count(second ? b : a) > LONG;
@@ -558,39 +565,60 @@ INLINE void queue_pair(const Problem& problem, const Environment& env, const Own
     }
 }
 
-// Makes the contacts of one part of the slots that wait in all lanes, which the lanes share out evenly; `turn` is the
-// lane that gets the next one.
-INLINE void make_part(const Problem& problem, Environment& env, const Own& own, const Mat* rotations,
-                      const Motion* motions, const int* slots, int waiting, int& turn, Contact* list, Real* weights,
-                      int& count) {
-    CollideRoom& room = env.chain.room.collide;
-    int all;
-    const int first = own.lanes.before(waiting, all);
+// Whether the sphere of a slot meets the other body in this step, and what is then known of both.
+INLINE bool meets(const Problem& problem, const Environment& env, int p, int k, const Mat* rotations, Number limit,
+                  Nearness& known) {
+    const bool second = k >= sphere_count(pair_b(p));
+    const int mine = second ? pair_a(p) : pair_b(p), other = second ? pair_b(p) : pair_a(p);
+    const long long row = env.geometry + 4LL * problem.spheres[contact_start(p) + k];
+    Vec center = env.bodies[mine].position + rotations[mine] * (problem.geometry.vector(row) - env.constants[mine].com);
+    Vec local = transposed(rotations[other], center - env.bodies[other].position) + env.constants[other].com;
+    const Number point[3] = {plain(local.x), plain(local.y), plain(local.z)};
+    Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(other), sphere_count(other)};
+    known.nearest = nearest_in(spheres, point, &known.members);
+    return known.nearest - Number(SMOOTHING_M) <= limit + plain(problem.geometry.at(row + 3));
+}
+
+// Leaves the slots of this lane from the place `from` of all that wait on, those against many spheres first.
+INLINE void leave_slots(Environment& env, const Own& own, const Candidates& queue, int many_before, int few_before,
+                        int from) {
+    QueueRoom& room = env.chain.room.collide.queue;
     KEEP_LOOP
-    for (int from = 0; own.lanes.any(from < all); from += WAITING) {
-        KEEP_LOOP
-        for (int i = 0; i < waiting; i++) {
-            const int place = first + i - from;
-            if (place < 0 || place >= WAITING) continue;
-            const int slot = (contact_start(slots[i] >> 16) + (slots[i] & 0xffff)) / LANES;
-            room.queue.slots[place] = slots[i];
-            room.queue.before[place] = own.warm ? own.before[slot] : none();
-        }
-        own.lanes.sync();
-        const int end = all - from < WAITING ? all - from : WAITING;
-        KEEP_LOOP
-        for (int i = (own.lanes.lane - turn) & (LANES - 1); i < end; i += LANES) {
-            const int p = room.queue.slots[i] >> 16, k = room.queue.slots[i] & 0xffff;
-            const Vec before = room.queue.before[i];
-            Parting parting;
-            int found = make_contact(problem, env, plain(before.x) > Number(0), before, p, k, rotations, motions,
-                                     room.limits[p], room.nears[p], parting, list[count], weights[count]);
-            if (found == 2) room.touched[p] = true;
-            if (found > 0) count++;
-        }
-        if (end > 0) turn = (turn + end) & (LANES - 1);
-        own.lanes.sync();
+    for (int i = 0; i < queue.many + queue.few; i++) {
+        const bool longer = i < queue.many;
+        const int place = (longer ? many_before + i : few_before + i - queue.many) - from;
+        if (place < 0 || place >= WAITING) continue;
+        const int slot = queue.slots[longer ? SLOTS - 1 - i : i - queue.many];
+        room.slots[place] = slot;
+        room.before[place] = own.warm ? own.before[(contact_start(slot >> 16) + (slot & 0xffff)) / LANES] : none();
     }
+    own.lanes.sync();
+}
+
+// Keeps those of the first `end` slots that meet another body; returns how many these are.
+INLINE int keep_meeting(const Problem& problem, Environment& env, const Lanes& lanes, const Mat* rotations, int end) {
+    CollideRoom& all = env.chain.room.collide;
+    QueueRoom& room = all.queue;
+    int slots[WAITING / LANES], met = 0, together;
+    Vec before[WAITING / LANES];
+    Nearness known[WAITING / LANES];
+    KEEP_LOOP
+    for (int i = lanes.lane; i < end; i += LANES) {
+        slots[met] = room.slots[i];
+        before[met] = room.before[i];
+        const int p = slots[met] >> 16;
+        if (meets(problem, env, p, slots[met] & 0xffff, rotations, all.limits[p], known[met])) met++;
+    }
+    const int place = lanes.before(met, together);
+    lanes.sync();
+    KEEP_LOOP
+    for (int i = 0; i < met; i++) {
+        room.slots[place + i] = slots[i];
+        room.before[place + i] = before[i];
+        room.known[place + i] = known[i];
+    }
+    lanes.sync();
+    return together;
 }
 
 // Gives each lane one of the contacts from `first` on, where there are not more than lanes, which takes one round in each
@@ -615,15 +643,33 @@ INLINE void spread_contacts(Environment& env, const Lanes& lanes, Contact* list,
     lanes.sync();
 }
 
-// Makes the contacts of all slots that wait, and distributes the effective mass among them.
+// Makes the contacts of all slots that wait, which the lanes share out evenly, and distributes the effective mass among
+// them. Which ones meet is found before: to make a contact takes long, and few do.
 INLINE void make_queued(const Problem& problem, Environment& env, const Own& own, const Mat* rotations,
                         const Motion* motions, const Candidates& queue, Contact* list, Real* weights, int& count) {
+    CollideRoom& room = env.chain.room.collide;
     const int first = count;
-    int turn = 0;
+    int turn = 0, many, few;
+    const int many_before = own.lanes.before(queue.many, many);
+    const int few_before = many + own.lanes.before(queue.few, few);
     KEEP_LOOP
-    for (int part = 0; part < 2; part++) {
-        const int* slots = queue.slots + (part ? SLOTS - queue.many : 0);
-        make_part(problem, env, own, rotations, motions, slots, part ? queue.many : queue.few, turn, list, weights, count);
+    for (int from = 0; own.lanes.any(from < many + few); from += WAITING) {
+        leave_slots(env, own, queue, many_before, few_before, from);
+        const int waiting = many + few - from < WAITING ? many + few - from : WAITING;
+        const int end = keep_meeting(problem, env, own.lanes, rotations, waiting);
+        KEEP_LOOP
+        for (int i = (own.lanes.lane - turn) & (LANES - 1); i < end; i += LANES) {
+            const int p = room.queue.slots[i] >> 16, k = room.queue.slots[i] & 0xffff;
+            const Vec before = room.queue.before[i];
+            Parting parting;
+            int found = make_contact(problem, env, plain(before.x) > Number(0), before, p, k, rotations, motions,
+                                     room.limits[p], room.nears[p], parting, &room.queue.known[i], list[count],
+                                     weights[count]);
+            if (found == 2) room.touched[p] = true;
+            if (found > 0) count++;
+        }
+        turn = (turn + end) & (LANES - 1);
+        own.lanes.sync();
     }
     if (!own.lanes.any(count > first)) return;
     spread_contacts(env, own.lanes, list, weights, first, count);
@@ -667,7 +713,7 @@ __device__ int touch_pair(const Problem& problem, Environment& env, const Own& o
             }
             const Vec before = own.warm ? own.before[(start + k) / LANES] : none();
             int found = make_contact(problem, env, own.warm, before, p, k, rotations, motions, reach.limit, reach.near,
-                                     parting, list[count], weights[count]);
+                                     parting, nullptr, list[count], weights[count]);
             if (found == 2) touching++;
             if (found > 0) count++;
         }
@@ -778,7 +824,7 @@ INLINE void split(Contact* list, int count, const int* groups) {
         Contact& c = list[i];
         int most = groups[group_of(c.a)], other = c.b >= 0 ? group_of(c.b) : -1;
         if (other >= 0 && groups[other] > most) most = groups[other];
-        Number share = most > 1 ? Number(1) / Number(most) : Number(1);
+        Number share = most > 1 ? quotient(Number(1), Number(most)) : Number(1);
         c.stop_n = share * c.stop_n;
         c.stop_t = share * c.stop_t;
     }
@@ -839,11 +885,11 @@ INLINE void list_reached(Environment& env, const Lanes& lanes) {
     CollideRoom& room = env.chain.room.collide;
     if (lanes.writes()) {
         int count = 0;
-        EACH_SHOWN
+        KEEP_LOOP
         for (int l = 0; l < LINKS; l++) {
             if (env.chain.known[l]) room.reached[count++] = l;
         }
-        EACH_SHOWN
+        KEEP_LOOP
         for (int b = 0; b < BODIES; b++) {
             if (is_free(b)) room.reached[count++] = LINKS + FREE(b);
         }
@@ -877,7 +923,7 @@ INLINE void sweep_contacts(Environment& env, const Lanes& lanes, Contact* list, 
         DIVIDED(lanes, r, all.reached_count) {
             const int place = all.reached[r], body = body_at(place);
             Vec push = all.pushes[place], moment = all.moments[place];
-            EACH_SHOWN
+            KEEP_LOOP
             for (int shown = 0; shown < LANES; shown++) {
                 const int bodies = room.bodies[shown];
                 if (bodies >> 16 == body) {
@@ -1170,12 +1216,10 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
     for (int p = 0; p < PAIRS; p++) {
         int a = pair_a(p), b = pair_b(p), touching = 0;
         if (b >= 0) {
+#if !QUEUED
 #if SHARED
             if (!own.lanes.any(room.near[p])) continue;
 #endif
-#if QUEUED
-            queue_pair(problem, env, own, p, rotations, queue);
-#else
             touching = touch_pair(problem, env, own, p, rotations, motions, list, weights, count);
 #endif
 #if FIXED
@@ -1211,6 +1255,15 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
 #endif
     }
 #if QUEUED
+    // environments of a warp each go to their own next pair, or each would wait for the pairs of all others
+    int next = -1;
+    KEEP_LOOP
+    while (true) {
+        do next++;
+        while (next < PAIRS && !(room.near[next] && pair_b(next) >= 0));
+        if (next >= PAIRS) break;
+        queue_pair(problem, env, own, next, rotations, queue);
+    }
     make_queued(problem, env, own, rotations, motions, queue, list, weights, count);
 #endif
 #if SHARED

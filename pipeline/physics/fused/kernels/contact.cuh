@@ -22,3 +22,10 @@ struct Contact {  // world frame, impulse on body a
     bool on;
 #endif
 };
+
+#if PAIRED
+struct Nearness {  // what is known of a point and the spheres of a body
+    Number nearest;    // distance of the nearest one
+    unsigned members;  // one bit for each, or for several, of those that may take part in the smooth distance
+};
+#endif

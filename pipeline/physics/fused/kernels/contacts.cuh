@@ -1,3 +1,5 @@
+// One contact: its law, and the distances from which it comes; formulas of `physics/contact_law.py`,
+// `physics/impulse_solver.py`, `physics/smooth_distance.py`, `physics/hull.py` and `physics/edge_contact.py`.
 struct Law {  // of a pair of materials, in a step
     Real step_s, inverse_step, stiffness, damping, friction;
 #if SURFACE
@@ -85,19 +87,24 @@ INLINE void response_of(const Response& m, Vec normal, Vec turn, Vec& linear, Ve
 }
 #endif
 
-// Returns the velocity of the gap that a contact asks for, given the gap and its velocity without the contact.
-INLINE Real aim(const Law& law, Real gap, Real speed) {
-    Real ahead = gap + law.step_s * speed, closed = Real(1);
+// Speed at which a gap has to change by the end of a step, given the gap [m or rad] and its speed without contact: that
+// of a spring and a damper. The damper acts for the share of the step in which the gap is closed.
+INLINE Real wanted_speed(Real gap, Real speed, Real step_s, Real inverse_step, Real stiffness, Real damping) {
+    Real ahead = gap + step_s * speed, closed = Real(1);
     if (plain(gap) > Number(0)) {
-        Real along = law.step_s * (plain(speed) < Number(0) ? -speed : speed);
-        closed = -ahead * reciprocal(at_least(along, Number(1e-12)));
-        closed = at_most(at_least(closed, Number(0)), Number(1));
+        Real way = step_s * (plain(speed) < Number(0) ? -speed : speed);
+        closed = at_most(at_least(-ahead * reciprocal(at_least(way, Number(1e-12))), Number(0)), Number(1));
     }
+    return speed - damping * closed * speed - stiffness * at_most(ahead, Number(0)) * inverse_step;
+}
+
+// The same by the law of a contact.
+INLINE Real aim(const Law& law, Real gap, Real speed) {
     Real stiffness = law.stiffness, damping = law.damping;
 #if SURFACE
     response(law.surface, law.step_s, speed, stiffness, damping);
 #endif
-    return speed - damping * closed * speed - stiffness * at_most(ahead, Number(0)) * law.inverse_step;
+    return wanted_speed(gap, speed, law.step_s, law.inverse_step, stiffness, damping);
 }
 
 // Sets the target velocity of a contact and returns whether it touches. `stop_n` and `stop_t` temporarily hold its
@@ -286,18 +293,31 @@ INLINE void squares_to(const Union& spheres, int first, const Number* point, Num
 }
 
 // The first members of a union that take part, which a GPU keeps in registers.
-const int HELD_MEMBERS = SHARED && !HOST ? 4 : 0;
+const int HELD_MEMBERS = QUEUED && !HOST ? 4 : 0;
 
-// Returns whether the union is nearer than `limit`; then also its smooth distance, that of the nearest sphere, and the
-// outward normal. Where that is undefined, between opposite spheres, it is `up`. All in the frame of the union.
-__device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec up, Real& distance, Number& nearest,
-                               Vec& outward) {
-    const Number width = Number(SMOOTHING_M);
-    Number point[3] = {plain(at.x), plain(at.y), plain(at.z)};
-    nearest = Number(1e30);
-    Number squares[AT_ONCE], radii[AT_ONCE];
+// How many times the spheres of a union are halved until each of 32 bits stands for so many of them.
+INLINE int halvings(int count) {
+    int times = 0;
+    INNER
+    while (count > 32 << times) times++;
+    return times;
+}
+
+// Distance of a point from the nearest sphere of a union, in its frame; where `members` is given, those are found, too.
+INLINE Number nearest_in(const Union& spheres, const Number* point, unsigned* members = nullptr) {
+    Number nearest = Number(1e30), squares[AT_ONCE], radii[AT_ONCE];
+    if (members) *members = 0;
+    const int times = members ? halvings(spheres.count) : 0;
+    INNER
     for (int first = 0; first < spheres.count; first += AT_ONCE) {
         squares_to(spheres, first, point, squares, radii);
+        if (members) {
+            SPREAD
+            for (int k = 0; k < AT_ONCE; k++) {
+                const bool may = first + k < spheres.count && below(squares[k], radii[k], nearest + Number(SMOOTHING_M));
+                *members |= (unsigned)may << ((first + k) >> times);
+            }
+        }
         SPREAD
         for (int k = 0; k < AT_ONCE; k++) {
 #if HOST || !SHARED || !SINGLE
@@ -308,6 +328,27 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
 #endif
         }
     }
+    return nearest;
+}
+
+#if QUEUED
+INLINE int lowest_bit(unsigned bits) {
+#if HOST
+    return __builtin_ctz(bits);
+#else
+    return __ffs(bits) - 1;
+#endif
+}
+#endif
+
+// Returns whether the union is nearer than `limit`; then also its smooth distance and the outward normal. Where that is
+// undefined, between opposite spheres, it is `up`. All in the frame of the union; `nearest` is the distance of its nearest
+// sphere, which is sought unless it is known.
+__device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec up, const Nearness* known, Real& distance,
+                               Number& nearest, Vec& outward) {
+    const Number width = Number(SMOOTHING_M);
+    Number point[3] = {plain(at.x), plain(at.y), plain(at.z)};
+    nearest = known ? known->nearest : nearest_in(spheres, point);
     if (nearest - width > limit) return false;
     // only spheres within the width of the nearest one take part: they are found once
     const int most = 64;
@@ -318,27 +359,45 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
         kept[q] = 0;
         held[q] = Number(1e30);
     }
-    for (int first = 0; first < spheres.count; first += AT_ONCE) {
-        squares_to(spheres, first, point, squares, radii);
-        SPREAD
-        for (int k = 0; k < AT_ONCE; k++) {
-            if (first + k >= spheres.count) break;
-            Number radius = radii[k];
-            if (!below(squares[k], radius, nearest + width)) continue;
-            Number gap = root(squares[k]) - radius - nearest;
+#if QUEUED
+    const int times = halvings(spheres.count);
+    INNER
+    for (unsigned rest = known ? known->members : ~0u; rest != 0; rest &= rest - 1) {
+        const int from = lowest_bit(rest) << times;
+        INNER
+        for (int i = from; i < from + (1 << times) && i < spheres.count; i++) {
+            const AlignedRow s = row_of(spheres.geometry.value + spheres.first + 4LL * i);
+            const Number x = point[0] - s.a, y = point[1] - s.b, z = point[2] - s.c;
+            const Number gap = root(x * x + y * y + z * z) - s.d - nearest;
             if (!(gap < width)) continue;
             SPREAD
             for (int q = 0; q < HELD_MEMBERS; q++) {
-                kept[q] = found == q ? first + k : kept[q];
+                kept[q] = found == q ? i : kept[q];
                 held[q] = found == q ? gap : held[q];
             }
             if (found >= HELD_MEMBERS && found < most) {
+                members[found] = i;
+                gaps[found] = gap;
+            }
+            found++;
+        }
+    }
+#else
+    Number squares[AT_ONCE], radii[AT_ONCE];
+    for (int first = 0; first < spheres.count; first += AT_ONCE) {
+        squares_to(spheres, first, point, squares, radii);
+        for (int k = 0; k < AT_ONCE && first + k < spheres.count; k++) {
+            if (!below(squares[k], radii[k], nearest + width)) continue;
+            Number gap = root(squares[k]) - radii[k] - nearest;
+            if (!(gap < width)) continue;
+            if (found < most) {
                 members[found] = first + k;
                 gaps[found] = gap;
             }
             found++;
         }
     }
+#endif
     bool few = found <= most;
     const int listed = few ? HELD_MEMBERS : 0;
     if (!few) {
@@ -353,12 +412,13 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
         radii_held[q] = spheres.radius(kept[q]);
         lengths[q] = root(dot(aways[q], aways[q]));
     }
-#define EACH_MEMBER for (int m = listed; m < (few ? found : spheres.count); m++)
+#define EACH_MEMBER INNER for (int m = listed; m < (few ? found : spheres.count); m++)
 #define MEMBER                                                                                     \
     int i = few ? members[m] : m;                                                                  \
     Number gap = few ? gaps[m] : root(square_to(spheres, i, point)) - plain_radius(spheres, i) - nearest;
     // solve sum over spheres of max(0, t - x)^2 = width^2 for t: Newton from above, where the sum is convex and rising
     Number t = width;
+    INNER
     for (int round = 0; round < 40; round++) {
         Number squares = Number(0), sum = Number(0);
         SPREAD
@@ -375,7 +435,7 @@ __device__ bool union_distance(const Union& spheres, Vec at, Number limit, Vec u
                 sum += below;
             }
         }
-        Number down = (squares - width * width) / (Number(2) * sum);
+        Number down = quotient(squares - width * width, Number(2) * sum);
         if (!(down > Number(SINGLE ? 1e-6 : 1e-13) * width)) break;
         t -= down;
     }

@@ -1,19 +1,21 @@
+// What an environment consists of, read from the kernel's inputs, and the motion of driven bodies.
+// What the kernel is given; units are m, kg, s and rad. `Packed` in `packing.py` says more.
 struct Problem {
     Input table;     // (environments, TABLE_WIDTH): numbers of each environment, in the order in which `load` reads
-    Input steps;     // (1 or environments, intervals, STEP_WIDTH): step, stiffness, damping, time at the start; then
-                     // stiffness and damping of each further law
+    Input steps;     // (1 or environments, intervals, STEP_WIDTH): step, stiffness and damping (without unit), time at the
+                     // start; then stiffness and damping of each further law
     Input geometry;  // (1 or environments, spheres, 4): centres in the body frame, radii
-    Input surfaces;  // (1 or environments, FIXED, 10): position, quaternion, size
-    Input drives;    // (1 or environments, samples, 14): time, position, quaternion, velocity, angular velocity
+    Input surfaces;  // (1 or environments, FIXED, SURFACE_WIDTH): position, quaternion, size
+    Input drives;    // (1 or environments, samples, SAMPLE_WIDTH): time, position, quaternion, velocity, angular velocity
     const int* __restrict__ substeps;      // of each interval
     const int* __restrict__ spheres;       // of each contact: row of the geometry
     const int* __restrict__ drive_starts;  // of each driven body: row of its first sample
     const int* __restrict__ drive_last;    // (1 or environments, driven bodies): index of the last interval
     const Number* __restrict__ mesh_numbers;  // of each mesh, see `TriangleMesh`
     const int* __restrict__ mesh_indices;
-    Number* __restrict__ frames;           // (environments, frames, bodies, 16)
+    Number* __restrict__ frames;           // (environments, frames, bodies, FRAME_WIDTH)
     Number* __restrict__ frame_tangents;
-    Number* __restrict__ labels;           // (environments, frames, contacts, 12)
+    Number* __restrict__ labels;           // (environments, frames, contacts, LABEL_WIDTH)
     Number* carried;                       // (environments, LANES, CARRIED_WIDTH): see `resume`
     int environments, frame_count, sweeps;
     long long steps_stride, geometry_stride, drive_stride;
@@ -141,6 +143,7 @@ INLINE const Weight& weight(const Environment& env, int b) { return env.weights[
 INLINE const Weight& weight(const Environment& env, int b) { return env.constants[b]; }
 #endif
 
+// Reads the numbers of an environment at the start.
 INLINE void load(const Problem& problem, Environment& env, Own& own) {
     const Input& table = problem.table;
     long long at = env.index * TABLE_WIDTH;
@@ -203,7 +206,7 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
     DIVIDED(own.lanes, b, BODIES) {
         Body& body = env.bodies[b];
         Constants& c = env.constants[b];
-        at = bodies + 23 * b;
+        at = bodies + BODY_COLUMNS * b;
         Sym inertia = {table.at(at + 1), table.at(at + 2), table.at(at + 3),
                        table.at(at + 4), table.at(at + 5), table.at(at + 6)};
 #if SHARED
@@ -274,7 +277,7 @@ INLINE void resume(const Problem& problem, Environment& env, Own& own) {
     const Number* row = problem.carried + (env.index * LANES + own.lanes.lane) * CARRIED_WIDTH;
     if (*row++ == Number(0)) return;
     EACH_BODY
-    for (int b = 0; b < BODIES; b++, row += 13) {
+    for (int b = 0; b < BODIES; b++, row += MOTION_COLUMNS) {
         if (!own.lanes.writes()) continue;
         Body& body = env.bodies[b];
         body.position = vec(row[0], row[1], row[2]);
@@ -307,12 +310,12 @@ INLINE void suspend(const Problem& problem, const Environment& env, const Own& o
     Number* row = problem.carried + (env.index * LANES + own.lanes.lane) * CARRIED_WIDTH;
     *row++ = Number(1);
     EACH_BODY
-    for (int b = 0; b < BODIES; b++, row += 13) {
+    for (int b = 0; b < BODIES; b++, row += MOTION_COLUMNS) {
         const Body& body = env.bodies[b];
-        Number numbers[13] = {body.position.x, body.position.y, body.position.z, body.quat.w, body.quat.x,
+        Number numbers[MOTION_COLUMNS] = {body.position.x, body.position.y, body.position.z, body.quat.w, body.quat.x,
                               body.quat.y, body.quat.z, body.velocity.x, body.velocity.y, body.velocity.z,
                               body.spin.x, body.spin.y, body.spin.z};
-        for (int k = 0; k < 13; k++) row[k] = numbers[k];
+        for (int k = 0; k < MOTION_COLUMNS; k++) row[k] = numbers[k];
     }
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
@@ -336,13 +339,13 @@ INLINE void suspend(const Problem& problem, const Environment& env, const Own& o
 // The commanded motion of a driven body; times must not decrease from call to call.
 __device__ void drive(const Problem& problem, Environment& env, int b, Real time) {
     int number = drive_number(b), last = problem.drive_last[env.drive_last + number];
-    long long start = env.drives + 14LL * problem.drive_starts[number];
+    long long start = env.drives + SAMPLE_WIDTH * problem.drive_starts[number];
     const Input& rows = problem.drives;
     int& cursor = env.cursors[b];
-    while (cursor < last && rows.value[start + 14LL * (cursor + 1)] <= plain(time)) cursor++;
-    Real first = rows.at(start), final = rows.at(start + 14LL * (last + 1));
+    while (cursor < last && rows.value[start + SAMPLE_WIDTH * (cursor + 1)] <= plain(time)) cursor++;
+    Real first = rows.at(start), final = rows.at(start + SAMPLE_WIDTH * (last + 1));
     bool moving = plain(time) >= plain(first) && plain(time) <= plain(final);
-    long long at = start + 14LL * cursor;
+    long long at = start + SAMPLE_WIDTH * cursor;
     Real held = plain(time) < plain(first) ? first : (plain(time) > plain(final) ? final : time);
     Real since = held - rows.at(at);
     Vec velocity = rows.vector(at + 8), omega = rows.vector(at + 11);

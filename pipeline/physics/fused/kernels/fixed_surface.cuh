@@ -1,3 +1,4 @@
+// Distances of spheres from fixed surfaces; formulas of `physics/fixed_surface.py` and `physics/surface_mesh.py`.
 #if FIXED
 // A fixed surface: its pose in the kernel's frame, and its size as in `physics/fixed_surface.py`.
 struct Fixed {
@@ -6,7 +7,7 @@ struct Fixed {
 };
 
 INLINE Fixed fixed_surface(const Problem& problem, const Environment& env, int s) {
-    long long at = env.surfaces + 10LL * s;
+    long long at = env.surfaces + SURFACE_WIDTH * s;
     const Input& rows = problem.surfaces;
     Quat quat = {rows.at(at + 3), rows.at(at + 4), rows.at(at + 5), rows.at(at + 6)};
     Fixed fixed = {rows.vector(at), rows.vector(at + 7), matrix(quat)};

@@ -1,3 +1,4 @@
+// Entry of the kernel on a CPU: threads take environments from a queue, a share of them at a time.
 struct Queue { const Problem* problem; int environments, share, next; };
 
 static void* work(void* shared) {

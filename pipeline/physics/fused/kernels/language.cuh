@@ -1,3 +1,8 @@
+// Words in which the other files are written, so that one source is the program of a thread of a GPU and of a CPU (HOST).
+// Constants in capitals are those of `Structure` in `structure.py`, lists in small letters are functions or arrays of it.
+//
+// Loops over bodies, slots and laws are unrolled where the numbers of all rounds fit into registers: an array of registers
+// has no places that are computed. SPREAD is always unrolled, KEEP_LOOP never: it would only be more code to fetch.
 #if HOST
 #define INLINE inline
 #define EACH_BODY
@@ -48,20 +53,17 @@
 // Loops of a few rounds, whose copies would not fit into the cache of instructions.
 #if SHARED
 #define INNER _Pragma("unroll 1")
-#define EACH_SHOWN _Pragma("unroll 8")
 #else
 #define INNER
 #endif
-// The coordinates above one, or that move a link: few, so that one does not wait for the places of those before it.
-#if SHARED && DEPTH <= 8
-#define EACH_ABOVE(k, depth) SPREAD for (int k = 0; k < DEPTH; k++) if (k < (depth))
+// The coordinates above one, or that move a link, and other short sums. Unrolled, their code would not fit into the cache
+// of instructions: that takes a tenth more time.
+#define EACH_ABOVE(k, depth) INNER for (int k = 0; k < (depth); k++)
+// The links, without the root of the first chain where that is not free: eight lanes then do sixteen links in two rounds.
+#if SHARED
+#define MOVED_LINKS(lanes, l) KEEP_LOOP for (int l = FIRST_MOVED + (lanes).lane; l < LINKS; l += LANES)
 #else
-#define EACH_ABOVE(k, depth) for (int k = 0; k < (depth); k++)
-#endif
-#if SHARED && !HOST
-#define SOME _Pragma("unroll 4")
-#else
-#define SOME
+#define MOVED_LINKS(lanes, l) for (int l = FIRST_MOVED; l < LINKS; l++)
 #endif
 // Loops along the trees of the chains, from the roots or towards them: links, or coordinates. Lanes do those of one
 // level at once.

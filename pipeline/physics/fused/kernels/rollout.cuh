@@ -1,3 +1,5 @@
+// An environment from its first frame to its last, what is written of it, and the entry of the kernel.
+// One step: the bodies' velocities without contact, contacts and their impulses, then the motion to the end of the step.
 INLINE void step(const Problem& problem, Environment& env, Own& own, Real time_after) {
     const Lanes& lanes = own.lanes;
     ROOM(Mat, rotations, BODIES, env.room);
@@ -89,7 +91,7 @@ INLINE void write_frame(const Problem& problem, const Environment& env, const La
             position = position - arm;
             velocity = velocity - cross(R * omega, arm);
         }
-        long long at = 16 * ((env.index * problem.frame_count + frame) * BODIES + b);
+        long long at = FRAME_WIDTH * ((env.index * problem.frame_count + frame) * BODIES + b);
         Quat q = body.quat;
         write_vector(problem, at, position);
         write_row(problem.frames + at + 4, plain(q.w), plain(q.x), plain(q.y), plain(q.z));
@@ -104,7 +106,7 @@ INLINE void write_frame(const Problem& problem, const Environment& env, const La
 #if RECORD
 INLINE void write_label(const Problem& problem, Environment& env, int frame, int contact, Tally& t, Vec normal,
                         Number gap, Vec point) {
-    Number* to = problem.labels + 12 * ((env.index * problem.frame_count + frame) * CONTACTS + contact);
+    Number* to = problem.labels + LABEL_WIDTH * ((env.index * problem.frame_count + frame) * CONTACTS + contact);
     bool acted = t.weight > Number(0);
     Number each = acted ? Number(1) / t.weight : Number(0);
     Number slides = acted && t.sliding > Number(0.5) * t.weight ? Number(1) : Number(0);
@@ -155,7 +157,7 @@ INLINE void write_labels(const Problem& problem, Environment& env, Own& own, int
 #if PAIRED
             if (pair_b(p) >= 0) {
                 Facing facing;
-                if (face(problem, env, p, k, rotations, Number(1e30), parting, facing)) {
+                if (face(problem, env, p, k, rotations, Number(1e30), parting, nullptr, facing)) {
                     gap = facing.gap;
                     normal = facing.normal;
                     point = facing.point;

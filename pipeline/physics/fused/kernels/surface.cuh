@@ -1,3 +1,4 @@
+// Effects of the contact of one body with the ground; formulas of `physics/effects` and `physics/friction_ellipse.py`.
 #if SURFACE
 struct Surface {
     Real stribeck, slow_speed;       // additional friction at slow slip; velocity scale

@@ -21,7 +21,6 @@ from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
 from cgwm.pipeline.physics.effects.residual_wrench import AXES, ResidualWrench
 from cgwm.pipeline.physics.fused import host, simulate_fused, unsupported
 from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
-from cgwm.pipeline.physics.fused.layout import in_frame, upright
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import lanes_for
@@ -324,15 +323,6 @@ def test_a_tilted_ground(fused: Fused) -> None:
         expected = simulate(world, state, times(0.04), driven, True)
         assert expected.contacts is not None and expected.contacts.impulse_n_s.abs().amax() > 0
         agree(expected, fused(world, state, times(0.04), driven, True), 1e-9)
-
-
-@pytest.mark.parametrize("x, y, z", [(0, 0, 0.5), (0.3, 0, 1), (0, -0.4, 1), (0.2, 0.5, -1), (0, 0, -1), (1e-5, 0, -1)])
-def test_the_frame_of_the_kernel_has_the_ground_s_normal_upwards(x: float, y: float, z: float) -> None:
-    normal = torch.tensor([x, y, z], dtype=F64)
-    normal = normal / normal.norm()
-    turn = upright(normal)
-    assert (turn is None) == ((x, y) == (0, 0) and z > 0)
-    torch.testing.assert_close(in_frame(turn, normal), torch.tensor([0, 0, 1.0], dtype=F64), rtol=0, atol=1e-9)
 
 
 def test_no_ground_one_frame_and_a_single_fixed_body(fused: Fused) -> None:

@@ -61,8 +61,7 @@ def lumps() -> Body:
 
 
 def scene(surfaces: tuple[Any, ...], *bodies: Body, ground: bool = False) -> World:
-    world = worlds.world_of(*(bodies or (lumps(),)), ground=ground, step_s=0.002)
-    return replace(world, surfaces=surfaces, iterations=4)
+    return replace(worlds.world_of(*(bodies or (lumps(),)), ground=ground, step_s=0.002), surfaces=surfaces)
 
 
 SHAPES = (
