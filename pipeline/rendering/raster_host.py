@@ -8,6 +8,7 @@ of the list, so that results do not depend on the number of threads.
 from __future__ import annotations
 
 import ctypes
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -30,7 +31,20 @@ SPHERES_PER_THREAD = 4000
 def supported(like: Tensor) -> bool:
     """Return whether the program runs here for tensors of this type and device."""
     on_host = like.device.type == "cpu" and like.dtype in (torch.float32, torch.float64)
-    return on_host and kernel_build.host_unavailable() is None
+    return on_host and unavailable(like.dtype == torch.float32) is None
+
+
+@cache
+def unavailable(single: bool) -> str | None:
+    """Return why the program does not run here in single or double precision; None where it does.
+
+    Where there is a compiler, the log says once why.
+    """
+    reason = kernel_build.host_failure(lambda: _library(single))
+    if reason is not None and kernel_build.compiler() is not None:
+        text = "the renderer's program for the CPU does not run: %s. PyTorch renders instead, five times slower."
+        logging.getLogger("cgwm").warning(text, reason)
+    return reason
 
 
 def draw(scene: TiledScene) -> TiledImages:
@@ -173,4 +187,5 @@ def _word(value: Tensor | int | float | None) -> Any:
 @cache
 def _library(single: bool) -> ctypes.CDLL:
     parts = [kernel_build.source_file(__name__, f"host/{name}.cuh") for name in ("common", "cull", "composite")]
-    return kernel_build.host_library("\n".join([f"#define SINGLE {int(single)}", *parts]))
+    flags = (*kernel_build.HOST_FLAGS, *kernel_build.vector_flags())
+    return kernel_build.host_library("\n".join([f"#define SINGLE {int(single)}", *parts]), flags)

@@ -14,7 +14,7 @@ from typing import Any
 
 from ...datasets.io.processors import processor_limits, processors
 from ...schemas.doctor import DoctorReport, ExtraState, Missing, PackageState
-from .kernel_build import compiler, unavailable
+from .kernel_build import compiler, host_unavailable, unavailable
 
 _IMPORT_NAMES = {"opencv-python-headless": "cv2"}
 EXTRAS = {
@@ -214,7 +214,8 @@ def _zstd_fault() -> str:
 
 def _renderer(cuda: bool) -> str:
     if not cuda:
-        return "torch, in tiles" if compiler() is None else "one program, compiled at run time, in tiles"
+        reason = host_unavailable()
+        return "one program, compiled at run time" if reason is None else f"torch, in tiles: {reason}"
     reason = unavailable()
     return "CUDA kernels, compiled at run time" if reason is None else f"torch, in tiles: {reason}"
 
@@ -222,7 +223,8 @@ def _renderer(cuda: bool) -> str:
 def _rollouts() -> str:
     if compiler() is None:
         return "torch; a C++ compiler (g++ or clang++) would make those on the CPU about ten times as fast"
-    return "one kernel, compiled at run time"
+    reason = host_unavailable()
+    return "one kernel, compiled at run time" if reason is None else f"torch on the CPU: {reason}"
 
 
 def _threads() -> str:

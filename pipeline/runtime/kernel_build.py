@@ -144,14 +144,33 @@ def compiler_version() -> str | None:
 @cache
 def host_unavailable() -> str | None:
     """Return why C++ programs cannot be built and loaded here; None where they can."""
+    return host_failure(lambda: host_library('extern "C" int answer() { return 42; }'))
+
+
+def host_failure(load: Callable[[], ctypes.CDLL]) -> str | None:
+    """Return why a C++ program, which `load` takes from `host_library`, does not build or load; None where it does."""
     if compiler() is None:
         return NO_COMPILER
     try:
-        host_library('extern "C" int answer() { return 42; }')
+        load()
     except (OSError, subprocess.SubprocessError) as error:
         message = error.stderr if isinstance(error, subprocess.CalledProcessError) else ""
         return f"the C++ compiler {compiler()} failed: {(message or str(error)).strip().splitlines()[-1]}"
     return None
+
+
+@cache
+def vector_flags() -> tuple[str, ...]:
+    """Return the option of the C++ compiler for the widest vectors of this processor; none where Linux names none.
+
+    Libraries that are built with it are cached under names of their own, so that other processors do not load them.
+    """
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return ()
+    known = next((set(line.split()) for line in lines if line.startswith("flags")), set())
+    return next(((f"-m{kind}",) for kind in ("avx512f", "avx2") if kind in known), ())
 
 
 def host_library(source: str, flags: tuple[str, ...] = HOST_FLAGS) -> ctypes.CDLL:

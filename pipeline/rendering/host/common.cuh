@@ -5,12 +5,6 @@
 #include <limits>
 #include <pthread.h>
 
-// One library has the loops for several kinds of processor, and the loader takes those for this one: caches are shared.
-#if defined(__x86_64__) && defined(__GLIBC__)
-#define FOR_EACH_PROCESSOR __attribute__((target_clones("avx512f", "avx2", "default")))
-#else
-#define FOR_EACH_PROCESSOR
-#endif
 #define INLINE static inline __attribute__((always_inline))
 
 #if SINGLE

@@ -264,8 +264,7 @@ INLINE Number least_exponent(const Lists& lists) {
     return lists.min_alpha > Number(0) ? (Number)std::log(lists.min_alpha) : -std::numeric_limits<Number>::infinity();
 }
 
-FOR_EACH_PROCESSOR
-void forward_tiles(Queue& queue, int first, int end, Number* scratch) {
+static void forward_tiles(Queue& queue, int first, int end, Number* scratch) {
     Number least = least_exponent(queue.lists);
     for (int tile = first; tile < end; tile++) {
         for (int p = 0; p < queue.lists.pixels; p += BLOCK) {
@@ -274,8 +273,7 @@ void forward_tiles(Queue& queue, int first, int end, Number* scratch) {
     }
 }
 
-FOR_EACH_PROCESSOR
-void backward_tiles(Queue& queue, int first, int end, Number* scratch) {
+static void backward_tiles(Queue& queue, int first, int end, Number* scratch) {
     Number least = least_exponent(queue.lists);
     for (int tile = first; tile < end; tile++) {
         for (int p = 0; p < queue.lists.pixels; p += BLOCK) {

@@ -87,8 +87,7 @@ INLINE int keep(const Cones& of, const int64_t* order, int64_t first, Room& room
     return count;
 }
 
-FOR_EACH_PROCESSOR
-void cull_block(const Scene& scene, Found& found, int camera, int block, Room& room) {
+static void cull_block(const Scene& scene, Found& found, int camera, int block, Room& room) {
     int wide = (scene.columns + SIDE - 1) / SIDE, top = block / wide * SIDE, left = block % wide * SIDE;
     int tiles[SIDE * SIDE], count = 0, all = scene.rows * scene.columns;
     for (int row = top; row < top + SIDE && row < scene.rows; row++) {

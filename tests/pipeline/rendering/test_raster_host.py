@@ -89,3 +89,17 @@ def test_nothing_is_drawn_without_spheres():
     given = scene(count=0)
     drawn = raster_host.draw(replace(given, groups=()))
     assert float(drawn.values.abs().sum() + drawn.alpha.abs().sum()) == 0
+
+
+def test_a_program_that_does_not_load_is_said_once_and_torch_renders(monkeypatch, caplog):
+    def broken(single):
+        raise OSError("undefined symbol: __cpu_model")
+
+    monkeypatch.setattr(raster_host, "_library", broken)
+    raster_host.unavailable.cache_clear()
+    like = torch.zeros(1)
+    assert not raster_host.supported(like)
+    assert not raster_host.supported(like)
+    raster_host.unavailable.cache_clear()
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "undefined symbol: __cpu_model. PyTorch renders instead" in caplog.text
