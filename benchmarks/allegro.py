@@ -37,7 +37,10 @@ from known_object import errors_of, known_object
 from store import Store
 
 mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs
-FRICTION, FINGER_FRICTION, CONTACT_TIME_S = 0.5, 1.0, 0.02
+FRICTION, FINGER_FRICTION, CONTACT_TIME_S, DAMPING_RATIO = 0.5, 1.0, 0.02, 8.0
+"""Those of the scenes; damping as forecasts of runs of development want it: objects and fingers overlap by millimetres
+there, and what overlaps must not be thrown apart."""
+ABOVE_M = 1.0
 JOINTS_RAD = (
     0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26,
 )  # fmt: skip
@@ -75,7 +78,7 @@ def model_of(scene: Path, corners: int) -> Model:
         points = found.geom_size[geom] * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     points = points @ turn.reshape(3, 3).T + found.geom_pos[geom]
     inertia = inertial.reshape(3, 3) @ np.diag(found.body_inertia[body]) @ inertial.reshape(3, 3).T
-    contact = ContactParameters(friction=FRICTION, contact_time_s=CONTACT_TIME_S, damping_ratio=1.0)
+    contact = ContactParameters(friction=FRICTION, contact_time_s=CONTACT_TIME_S, damping_ratio=DAMPING_RATIO)
     balls = rounded_hull(points, corners)
     return known_object(balls, float(found.body_mass[body]), inertia, found.body_ipos[body], contact)
 
@@ -100,7 +103,8 @@ def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
                 "file": "envs/xmls/allegro_right_hand.xml",
                 "quat_wxyz": (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)),
                 "friction": dict.fromkeys(parts, FINGER_FRICTION),
-                "touching": touching,
+                "corners": given.corners,
+                "touching": touching if given.touching else (),
             },
             "start": {
                 "position_m": (float(place[0]), float(place[1]), start_m[2] + given.lift),
@@ -129,8 +133,9 @@ def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
 def measure(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> dict[str, Any]:
     """Return the figures of one run."""
     task = task_of(folder, scene, seed, given)
-    controller = HandController(model_of(scene, given.corners), task)
-    # the wanted place lies within the fingers as they are at the start, which a task may not ask
+    # some starts overlap with the thumb, and the wanted place with the fingers at the start: a task may ask neither
+    above = task.start.model_copy(update={"position_m": (*task.start.position_m[:2], ABOVE_M)})
+    controller = HandController(model_of(scene, given.corners), task.model_copy(update={"start": above}))
     goal = task.goal.model_copy(update={"position_m": PLACES[scene.stem.removeprefix("env_allegro_")][1]})
     controller.task = task.model_copy(update={"goal": goal})
     controller.hand = replace(controller.hand, task=controller.task)
@@ -167,10 +172,13 @@ def main() -> None:
     parser.add_argument("--objects", default=",".join(PLACES))
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--hz", type=float, default=10.0)
+    parser.add_argument("--hz", type=float, default=100 / 3)
     parser.add_argument("--samples", type=int, default=16)
-    parser.add_argument("--corners", type=int, default=32, help="of the hull of the object")
-    parser.add_argument("--horizon", type=float, default=0.5)
+    parser.add_argument("--corners", type=int, default=16, help="of the hulls of the object and of each part of a link")
+    parser.add_argument(
+        "--touching", action=argparse.BooleanOptionalAction, default=False, help="fingers touch each other"
+    )
+    parser.add_argument("--horizon", type=float, default=0.4)
     parser.add_argument("--step", type=float, default=0.01)
     parser.add_argument("--speed", type=float, default=2.0, help="limit of targets [rad/s]; theirs: 0.2 rad a command")
     parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
