@@ -17,6 +17,9 @@ __device__ float transposed_sum(float* values, int lane) {
     return values[0] + __shfl_xor_sync(FULL, values[0], 1);
 }
 
+// Adds up the derivatives of a loss by each sphere in each camera's frame, from those by the pixels; a block for each tile,
+// a warp for 8 x 8 of its pixels. Spheres come from the nearest to the farthest, as in `composite_forward`. Writes
+// gradients (C, N, GROUPS * VALUES).
 extern "C" __global__ void __launch_bounds__(128) composite_backward(
     const float4* centres, const float* log_opacities, const float4* spans, const float* features, const int* rows,
     const int* starts, const float* Ks, const float2* rays, const float* out, const float* out_left,
@@ -56,6 +59,7 @@ extern "C" __global__ void __launch_bounds__(128) composite_backward(
             float raw[2] = {alpha_at(seen, pixels[0]), alpha_at(seen, pixels[1])};
             if (!__any_sync(FULL, fmaxf(raw[0], raw[1]) >= min_alpha)) continue;
             float4 point = sources.points[j];
+            // derivatives by the centre (3), by -1 / (2 s^2), by the logarithm of the opacity, then by the features
             float values[GROUPS * VALUES];
 #pragma unroll
             for (int i = 0; i < GROUPS * VALUES; i++) values[i] = 0;
@@ -73,6 +77,7 @@ extern "C" __global__ void __launch_bounds__(128) composite_backward(
                 rest[h] -= weight * along;
                 float grad = raw[h] > 0.99f ? 0.0f : (along * left[h] - __fdividef(rest[h], 1.0f - alpha)) * alpha;
                 left[h] -= weight;
+                // the centre times the ray, as a cross product, is (b, -a, c): its square is the squared distance
                 float a = point.x - point.z * at.x, b = point.y - point.z * at.y, c = a * at.y - b * at.x;
                 float factor = 2.0f * point.w * at.inverse * grad;
                 float by_a = factor * (a + c * at.y), by_b = factor * (b - c * at.x);

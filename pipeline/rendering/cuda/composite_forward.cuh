@@ -1,3 +1,6 @@
+// Draws the spheres of each tile over each other, from the nearest to the farthest; a block for each tile, a warp for 8 x 8
+// of its pixels. Writes features out (C, H, W, F), the share of light that passes all spheres, and mean and median depth
+// (C, H, W) [m]. COUNT of the features from FIRST on are drawn in a pass; the first one writes the rest.
 extern "C" __global__ void __launch_bounds__(128) composite_forward(
     const float4* centres, const float* log_opacities, const float4* spans, const float* features, const int* rows,
     const int* starts, const float* Ks, const float2* rays, float* out, float* out_left, float* out_depth,

@@ -457,6 +457,11 @@ INLINE Column single_column(const Chain& chain, const Body* bodies, int d, Vec p
     return kind == 2 ? hinge : slide;
 }
 
+// Sum of the impulses of a joint: of its lower and upper limit, and of its dry friction.
+INLINE Real joint_impulse(const Chain& chain, int j) {
+    return chain.impulses[3 * j] - chain.impulses[3 * j + 1] + chain.impulses[3 * j + 2];
+}
+
 #if SHARED
 // Makes the columns of all links that contact may move, at the pose of the start of the step.
 INLINE void reveal_links(Chain& chain, const Lanes& lanes, const Body* bodies) {
@@ -477,11 +482,10 @@ INLINE void reveal_links(Chain& chain, const Lanes& lanes, const Body* bodies) {
     lanes.sync();
 }
 
-// Sum of the impulses of the joint of a coordinate; of those of a free root there is none.
-INLINE Real joint_impulse(const Chain& chain, int d) {
+// The same of a coordinate; those of a free root have no joint.
+INLINE Real dof_impulse(const Chain& chain, int d) {
     const int j = dof_joint[d];
-    if (j < 0) return Real(0);
-    return chain.impulses[3 * j] - chain.impulses[3 * j + 1] + chain.impulses[3 * j + 2];
+    return j < 0 ? Real(0) : joint_impulse(chain, j);
 }
 
 // Mass-weighted motion of the chains under the impulses of their joints and on their links; each coordinate is summed
@@ -490,10 +494,10 @@ INLINE void push_chains(Chain& chain, const Lanes& lanes) {
     const CollideRoom& room = chain.room.collide;
     DIVIDED(lanes, d, DOFS) {
         const int last = dof_depth[d] - 1;
-        Real sum = chain.active ? chain.inverse[d * DEPTH + last] * joint_impulse(chain, d) : Real(0);
+        Real sum = chain.active ? chain.inverse[d * DEPTH + last] * dof_impulse(chain, d) : Real(0);
         if (chain.active) {
             INNER for (int i = below_start[d]; i < below_start[d + 1]; i++) {
-                sum += chain.inverse[dof_below[i] * DEPTH + last] * joint_impulse(chain, dof_below[i]);
+                sum += chain.inverse[dof_below[i] * DEPTH + last] * dof_impulse(chain, dof_below[i]);
             }
         }
         INNER for (int i = moved_start[d]; i < moved_start[d + 1]; i++) {
@@ -549,7 +553,7 @@ INLINE void push_joints(Chain& chain) {
     for (int j = 0; j < JOINTS; j++) {
         if (!chain.busy[j]) continue;
         int d = joint_dof[j];
-        Real sum = chain.impulses[3 * j] - chain.impulses[3 * j + 1] + chain.impulses[3 * j + 2];
+        Real sum = joint_impulse(chain, j);
         for (int k = 0; k < dof_depth[d]; k++) {
             chain.moved[dof_above[d * DEPTH + k]] += sum * chain.inverse[d * DEPTH + k];
         }

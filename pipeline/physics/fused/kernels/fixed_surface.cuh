@@ -157,14 +157,20 @@ INLINE int cell_of(Number at, Number low, Number cell, int count) {
     return k < Number(0) ? 0 : (k > Number(count - 1) ? count - 1 : (int)k);
 }
 
+// How far a point is outside of the box of a mesh along each axis, 0 within.
+INLINE Point beyond_box(const TriangleMesh& m, Point p) {
+    Point low = m.low - p, high = p - m.high;
+    Point out = {greater(greater(low.x, high.x), Number(0)), greater(greater(low.y, high.y), Number(0)),
+                 greater(greater(low.z, high.z), Number(0))};
+    return out;
+}
+
 // Finds the contacts of a sphere with a mesh; see `SurfaceMesh.features`.
 __device__ void find(const TriangleMesh& m, Point p, Number radius, Number margin, Searched& found) {
     Number reach = (m.solid ? greater(radius, m.cell) : radius) + margin;
     found.count = 0;
     found.inside = false;
-    Point far_low = m.low - p, far_high = p - m.high;
-    Point outside = {greater(greater(far_low.x, far_high.x), Number(0)), greater(greater(far_low.y, far_high.y), Number(0)),
-                     greater(greater(far_low.z, far_high.z), Number(0))};
+    Point outside = beyond_box(m, p);
     if (!(dot(outside, outside) < reach * reach)) return;
     int from[3] = {cell_of(p.x - reach, m.low.x, m.cell, m.cells[0]), cell_of(p.y - reach, m.low.y, m.cell, m.cells[1]),
                    cell_of(p.z - reach, m.low.z, m.cell, m.cells[2])};
@@ -266,20 +272,14 @@ __device__ Meeting feature_distance(const TriangleMesh& m, int number, bool insi
     return meeting;
 }
 
-INLINE Number box_distance(const TriangleMesh& m, Point p) {
-    Point low = m.low - p, high = p - m.high;
-    Point out = {greater(greater(low.x, high.x), Number(0)), greater(greater(low.y, high.y), Number(0)),
-                 greater(greater(low.z, high.z), Number(0))};
-    return root(dot(out, out));
-}
 #endif
 
 // A lower bound of the distance of a point, in the frame of the surface; exact but for meshes.
 INLINE Number least_distance(const Problem& problem, const Fixed& fixed, int s, Vec at) {
 #if MESHES
     if (surface_kind(s) == MESH_KIND) {
-        Point p = {plain(at.x), plain(at.y), plain(at.z)};
-        return box_distance(triangle_mesh(problem, s), p);
+        Point p = {plain(at.x), plain(at.y), plain(at.z)}, outside = beyond_box(triangle_mesh(problem, s), p);
+        return root(dot(outside, outside));
     }
 #endif
     Vec outward;
