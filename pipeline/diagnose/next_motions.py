@@ -4,8 +4,8 @@ An effect counts as seen if one of its usual size, times `experiment.seen_sizes`
 with the margin of a detection limit, and as told apart if every other effect of contact, fitted in its stead, would
 leave a lead that suffices. Both follow from noncentralities (`contact_information`), which grow with the square of the
 size. How large an effect is, is not known: its size is taken as log-uniform from that size to `SIZES` times it. The
-worth of motions is the expected number of effects that are seen then, and told apart, each counted half; motions are
-chosen one after the other (greedily).
+worth of motions is the expected number of effects that are seen then, and told apart, each counted half, and the one
+that the data suggest more than others; motions are chosen one after the other (greedily).
 """
 
 from __future__ import annotations
@@ -33,8 +33,11 @@ from .verdict import Findings
 Array = NDArray[np.float64]
 
 LIMITS = THRESHOLDS.experiment
-SIZES = 3.0
-"""Largest size of an effect for which motions are chosen, in smallest ones: larger ones show in most motions."""
+SIZES = 10.0
+"""Largest size of an effect for which motions are chosen, in smallest ones: where the noise hides small effects of all
+kinds, motions that show large ones are asked for."""
+LEADING = 3.0
+"""How much more the effect counts that ranks first in contact, with a positive score that does not suffice."""
 WORTH_TELLING = 0.8
 """Share to which the smallest visible size of an effect must fall for the report to name it."""
 MOST_MOTIONS = 3
@@ -55,6 +58,8 @@ class Question:
     """Information by kind of motion."""
     rivals: frozenset[str] = frozenset()
     """Effects that have to be told apart; empty for all effects of contact."""
+    leading: str = ""
+    """Effect that the data suggest, without enough evidence to name it; empty for none."""
 
     def shares(self, chosen: list[int], more: Sequence[int], times: int = 1) -> tuple[Array, Array]:
         """Return shares (V, M) of what each effect needs to be seen, and to be told apart; 1 is enough.
@@ -116,6 +121,7 @@ def next_motions(prepared: Prepared, findings: Findings, candidates: Sequence[Ca
         ),
         channels=tuple(channels),
         rivals=rivals,
+        leading=_leading(findings),
     )
     chosen = best_motions(question, len(motions))
     if not chosen:
@@ -164,7 +170,8 @@ def _worth(question: Question, seen: Array, apart: Array) -> Array:
         if question.rivals and name not in question.rivals:
             continue
         rows = [k for k, other in enumerate(question.names) if other == name]
-        total += 0.5 * (_chance(seen[rows]) + _chance(np.minimum(seen[rows], apart[rows]))).mean(0)
+        weight = LEADING if name == question.leading else 1.0
+        total += weight * 0.5 * (_chance(seen[rows]) + _chance(np.minimum(seen[rows], apart[rows]))).mean(0)
     return total
 
 
@@ -219,6 +226,13 @@ def _rivals(findings: Findings) -> frozenset[str] | None:
     if any(len(one.equals) > 1 for one in contact):
         return frozenset(itertools.chain.from_iterable((e.name for e in one.equals) for one in contact))
     return None if contact else frozenset()
+
+
+def _leading(findings: Findings) -> str:
+    """Return the effect that ranks first in contact where its score is positive, but none was selected; or nothing."""
+    first = next((one for one in findings.contact if one.test.admissible), None)
+    selected = any(one.where == "contact" for one in findings.chosen)
+    return first.name if first is not None and first.score > 0 and not selected else ""
 
 
 def _world_without_contact_effects(findings: Findings) -> World:

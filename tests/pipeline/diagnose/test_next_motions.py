@@ -117,6 +117,30 @@ def test_nothing_is_asked_for_where_everything_is_bounded(known: float, asked: i
 
 # In the suite: the next test fits two frictions.
 @pytest.mark.evidence
+@pytest.mark.parametrize(("leading", "first"), [("", 0), ("torsional_friction", 1)])
+def test_what_the_data_suggest_is_asked_for_first(leading: str, first: int) -> None:
+    names = ("viscous_friction", "torsional_friction")
+    variants = variants_of([Candidate(name, load_effect(name)) for name in names], torch.tensor([[0.0, 0.0, -9.81]]))
+    channel = Channel(
+        name="sliding",
+        base=1,
+        columns=((1,), (2,)),
+        prior=np.ones(1),
+        data=np.zeros((3, 3)),
+        episodes=np.zeros((2, 3, 3)),
+        motions=np.stack([np.diag([1e4, 1e4, 1.0]), np.diag([1e4, 1.0, 6e3])]),
+        count=100,
+    )
+    question = Question(
+        variants=tuple(variants),
+        names=names,
+        sizes=(np.array([0.2]),) * 2,
+        channels=(channel,),
+        leading=leading,
+    )
+    assert best_motions(question, 2)[0] == first
+
+
 def test_a_friction_that_grows_with_the_speed_is_fitted_beside_a_constant_one() -> None:
     """The two cancel each other: joint steps from a viscosity of 0 stalled at a hundredth of it."""
     truth, world = world_with("ball", {"viscous_friction": {"c_v": 1.5}}), world_with("ball")
