@@ -36,8 +36,6 @@ LIMITS = THRESHOLDS.experiment
 SIZES = 10.0
 """Largest size of an effect for which motions are chosen, in smallest ones: where the noise hides small effects of all
 kinds, motions that show large ones are asked for."""
-LEADING = 3.0
-"""How much more the effect counts that ranks first in contact, with a positive score that does not suffice."""
 WORTH_TELLING = 0.8
 """Share to which the smallest visible size of an effect must fall for the report to name it."""
 MOST_MOTIONS = 3
@@ -170,7 +168,7 @@ def _worth(question: Question, seen: Array, apart: Array) -> Array:
         if question.rivals and name not in question.rivals:
             continue
         rows = [k for k, other in enumerate(question.names) if other == name]
-        weight = LEADING if name == question.leading else 1.0
+        weight = LIMITS.suggested if name == question.leading else 1.0
         total += weight * 0.5 * (_chance(seen[rows]) + _chance(np.minimum(seen[rows], apart[rows]))).mean(0)
     return total
 

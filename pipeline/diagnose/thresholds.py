@@ -324,6 +324,14 @@ class ExperimentThresholds:
         "least worth of a motion that is asked for, in effects of contact that it shows",
         BY_ARGUMENT,
     )
+    suggested: float = threshold(
+        3.0,
+        "1",
+        "how much more the effect counts that ranks first in contact, with a positive score that does not suffice",
+        BY_ARGUMENT,
+        "experiments in sequence, development: looked at in two cases; one is named after a round as before, the other "
+        "silent as before with a larger score",
+    )
     law_margin: float = threshold(
         10.0, "chi2", "a term enters a residual law if chi2 falls by this more than its penalty"
     )
