@@ -11,6 +11,7 @@ from .base import FileModel, read_toml
 from .capture import Name
 from .errors import did_you_mean
 from .quantities import Coordinate, Duration, Friction, Length, Mass, Step
+from .toml_text import toml_value
 
 TASK_FORMAT = "cgwm-task/1"
 CONTROL_FORMAT = "cgwm-control/1"
@@ -270,17 +271,7 @@ def _told(text: str) -> str:
 
 
 def _entry(name: str, value: object, text: str) -> list[str]:
-    return ["", f"# {_told(text)}", f"# {name} =" if value is None else f"{name} = {_value(value)}"]
-
-
-def _value(value: object) -> str:
-    if isinstance(value, dict):
-        return f"{{ {', '.join(f'{name} = {_value(entry)}' for name, entry in value.items())} }}" if value else "{}"
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_value, value))}]"
-    return repr(value)
+    return ["", f"# {_told(text)}", f"# {name} =" if value is None else f"{name} = {toml_value(value)}"]
 
 
 TASKS = {"push": ControlTask()}

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, PrivateAttr, model_serializer, model_validator
 
 from .base import FileModel, read_toml
+from .toml_text import toml_key, toml_value
 
 CUT_OFF = 3.0
 """A normal distribution is cut off at this many standard deviations, so that a plan has no outliers."""
@@ -259,7 +260,7 @@ def plan_toml(plan: SamplingPlan, comments: bool = True) -> str:
         told = RejectionRules.model_fields if comments and table == "reject" else {}
         lines += ["", *([f"# {SamplingPlan.model_fields[table].description}"] if comments else []), f"[{table}]"]
         for name, value in entries.items():
-            lines += _entry(_key(name), value, told[name].description if name in told else None)
+            lines += _entry(toml_key(name), value, told[name].description if name in told else None)
     return "\n".join(lines).strip() + "\n"
 
 
@@ -271,23 +272,5 @@ _DOCUMENT = (
 
 def _entry(name: str, value: Any, text: str | None) -> list[str]:
     if text is None:
-        return [] if value is None else [f"{name} = {_value(value)}"]
-    return ["", f"# {' '.join(text.split())}", f"# {name} =" if value is None else f"{name} = {_value(value)}"]
-
-
-def _key(name: str) -> str:
-    return name if name.replace("_", "").replace("-", "").isalnum() else f'"{name}"'
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, Distribution):
-        return _value(value.model_dump())
-    if isinstance(value, dict):
-        return f"{{ {', '.join(f'{kind} = {_value(numbers)}' for kind, numbers in value.items())} }}"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_value, value))}]"
-    return repr(value)
+        return [] if value is None else [f"{name} = {toml_value(value)}"]
+    return ["", f"# {' '.join(text.split())}", f"# {name} =" if value is None else f"{name} = {toml_value(value)}"]

@@ -260,6 +260,9 @@ def test_printed_tasks_are_read_again(tmp_path: Path) -> None:
     for name, task in HAND_TASKS.items():
         (tmp_path / f"{name}.toml").write_text(task_toml(task))
         assert read_any_task(tmp_path / f"{name}.toml").model_dump() == task.model_dump()
+    named = hand_task(tmp_path, robot={"friction": {"arm/1": 0.4, "a b": 0.2}, "apart": ('the "thumb"', "C:\\tip")})
+    (tmp_path / "named.toml").write_text(task_toml(named))
+    assert read_any_task(tmp_path / "named.toml").model_dump() == named.model_dump()
 
 
 @pytest.mark.parametrize(
