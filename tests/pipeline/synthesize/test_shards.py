@@ -518,7 +518,7 @@ def test_the_command_line_speaks_of_shards(model: Path, parts: Path, monkeypatch
     refused = forked(*words, "--shard=1/3", "--shards=3")
     assert (refused.returncode, refused.stderr) == (
         2,
-        "--shard 1/3 is one shard, --shards makes all.\nAllowed: one of the two.\n",
+        "--shard 1/3 is one shard, --shards makes all.\nAllowed: one of the two.\nNext: leave one of the two out.\n",
     )
 
 

@@ -19,7 +19,7 @@ from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
 from cgwm.pipeline.physics.effects.residual_wrench import AXES, ResidualWrench
-from cgwm.pipeline.physics.fused import host, simulate_fused, unsupported
+from cgwm.pipeline.physics.fused import simulate_fused, unsupported
 from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
@@ -737,7 +737,7 @@ def crowded(count: int) -> World:
 def test_the_torch_engine_is_taken_on_a_cpu_without_a_compiler(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(host, "compiler", lambda: None)
+    monkeypatch.setattr(kernel_build, "compiler", lambda: None)
     monkeypatch.setattr(engine, "compiler", lambda: None)
     world, state = world_of(box_body()), tossed(1)
     with caplog.at_level("INFO", "cgwm"):
@@ -802,8 +802,8 @@ def test_a_compiler_that_fails_leaves_the_torch_engine(monkeypatch: pytest.Monke
     broken = tmp_path / "g++"
     broken.write_text("#!/bin/sh\necho 'no room left' >&2\nexit 1\n")
     broken.chmod(0o755)
-    monkeypatch.setattr(host, "compiler", lambda: str(broken))
-    monkeypatch.setattr(host, "_trial", host._trial.__wrapped__)
+    monkeypatch.setattr(kernel_build, "compiler", lambda: str(broken))
+    monkeypatch.setattr(kernel_build, "host_unavailable", kernel_build.host_unavailable.__wrapped__)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert lacking(world_of(box_body())) == f"the C++ compiler {broken} failed: no room left"
 
@@ -812,14 +812,14 @@ def test_a_compiler_that_fails_leaves_the_torch_engine(monkeypatch: pytest.Monke
 def test_a_kernel_is_built_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     source = 'extern "C" int answer() { return 42; }'
-    assert host._built(source).answer() == 42
+    assert kernel_build.host_library(source).answer() == 42
     kept = list((tmp_path / "cgwm" / "kernels").iterdir())
     assert [path.suffix for path in kept] == [".so"]
-    monkeypatch.setattr(host.subprocess, "run", None)
-    assert host._built(source).answer() == 42
+    monkeypatch.setattr(kernel_build.subprocess, "run", None)
+    assert kernel_build.host_library(source).answer() == 42
     (tmp_path / "cgwm" / "kernels").chmod(0o777)
     with pytest.raises(TypeError):  # what others may have written is not loaded
-        host._built(source)
+        kernel_build.host_library(source)
 
 
 @NEEDS_GPU
