@@ -44,7 +44,7 @@ def sentence(runs: Sequence[ControlRun], task: AnyTask, clock: ClockName) -> str
     if isinstance(task, HandTask) and task.success.goals > 1:
         minutes = sum(run.time_s for run in runs) / 60
         goals = sum(run.goals for run in runs)
-        words.append(f"{goals} goals in {minutes:.1f} minutes")
+        words.append(f"{goals} goal{'s' * (goals != 1)} in {minutes:.1f} minutes")
     for kind, text in _ENDS.items():
         count = sum(run.ended == kind for run in runs)
         words += [f"{count} {text}"] if count else []
