@@ -71,18 +71,27 @@ _WIDTHS = {
 """Numbers of a row of the kernels' arrays: of 64 bits there, as products with them may need."""
 
 _FILES = (
-    "arithmetic",  # dual numbers, vectors and rotations, and sums over the threads of an environment
-    "surface",  # effects of the contact between one body and the ground: formulas of physics/effects
+    "arithmetic",  # numbers, vectors and rotations, and exchanges between the threads of an environment
+    "surface",  # effects of the contact between one body and the ground
     "contact",  # what a contact of a step is
     "chain",  # links of chains and their joints, as read from the table
-    "contacts",  # contacts with ground, spheres and hulls: contact_detection, edge_contact, hull, impulse_solver
+    "contact_law",  # what one contact asks for, and the change of its impulse in an iteration
+    "sphere_union",  # distance from the spheres of a body
+    "hull",  # distance from their hull
+    "contact_shares",  # the effective mass of each contact of a pair
     "environment",  # what the kernel is given, and the state of an environment read from it
-    "fixed_surface",  # distances of spheres to fixed surfaces: physics/fixed_surface and physics/surface_mesh
-    "chain_motion",  # kinematics, equations of motion and joints of chains: formulas of chain_dynamics and joint_rows
-    "collision",  # flight, and the contacts of a step with their impulses: formulas of rigid_body and contact_solver
+    "fixed_surface",  # distances of spheres to fixed surfaces
+    "chain_motion",  # kinematics, equations of motion and joints of chains
+    "flight",  # bodies without contact
+    "facing",  # gap, normal and point of each possible contact of two bodies
+    "meeting",  # which bodies may touch in a step
+    "queue",  # contacts that lanes share out among each other
+    "touching",  # the contacts of a pair
+    "sweeps",  # iterations over impulses
+    "collision",  # all contacts of a step
     "rollout",  # an environment from its first frame to its last, and what is written of it
 )
-"""Files of `kernels/` in the order in which they are compiled, after `language`, with the origin of their formulas."""
+"""Files of `kernels/` in the order in which they are compiled, after `language`; each names its formulas' origin."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,285 @@
+// Gap, normal and point of each possible contact of two bodies; formulas of `physics/contact_detection.py`.
+#if PAIRED
+// Two unit tangents of a contact, orthogonal to its normal, chosen in the world frame.
+INLINE void tangents(const Environment& env, Vec normal, Vec& first, Vec& second) {
+#if TURNED
+    Vec n = transposed(env.turn, normal);
+#else
+    Vec n = normal;
+#endif
+    Number sign = plain(n.z) >= Number(0) ? Number(1) : Number(-1);
+    Real a = -reciprocal(Real(sign) + n.z), b = n.x * n.y * a;
+    first = vec(Real(1) + sign * (n.x * n.x * a), sign * b, -sign * n.x);
+    second = vec(b, Real(sign) + n.y * n.y * a, -n.y);
+#if TURNED
+    first = env.turn * first;
+    second = env.turn * second;
+#endif
+}
+
+struct Facing {
+    Vec normal, point;  // world frame; the normal points from body b of the pair to body a
+    Real gap;
+    Number sharp_gap;  // to the nearest sphere, without smoothing
+};
+
+#if !HULLS
+struct Parting {};
+#else
+INLINE Hull hull_of(const Problem& problem, const Environment& env, int b) {
+    Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(b), sphere_count(b)};
+    Hull hull = {spheres,       env.geometry + 4LL * hull_start(b), face_count(b), edge_count(b),
+                 support_count(b), ridge_count(b)};
+    return hull;
+}
+
+// Raises `most` to the greatest height that the spheres of another hull have over a plane of this one; sets `axis` to
+// the normal of that plane, in the world frame, times `sign`.
+INLINE void part_by(const Problem& problem, const Environment& env, int b, int other, const Mat* rotations,
+                    Number sign, Number& most, Number* axis) {
+    Hull hull = hull_of(problem, env, b), its = hull_of(problem, env, other);
+    Vec origin = env.bodies[other].position - rotations[other] * env.constants[other].com - env.bodies[b].position;
+    Vec shift = transposed(rotations[b], origin) + env.constants[b].com;
+    Number from[3] = {plain(shift.x), plain(shift.y), plain(shift.z)};
+    for (int i = 0; i < hull.faces; i++) {
+        Vec normal = rotations[b] * problem.geometry.vector(hull.row + 12LL * i);
+        Vec within = transposed(rotations[other], normal);
+        Number x = plain(within.x), y = plain(within.y), z = plain(within.z), least = Number(1e30);
+        for (int k = 0; k < its.supports; k++) {
+            const Number* s = its.support(k);
+            least = lesser(least, x * s[0] + y * s[1] + z * s[2] - s[3]);
+        }
+        least += hull.affine(i, 0, from);
+        if (!(least > most)) continue;
+        most = least;
+        axis[0] = sign * plain(normal.x);
+        axis[1] = sign * plain(normal.y);
+        axis[2] = sign * plain(normal.z);
+    }
+}
+
+// Returns the face of a body whose normal is nearest to `sign` times the axis; -1 where none is parallel to it.
+INLINE int flat_face(const Problem& problem, const Environment& env, int b, const Mat& rotation, Number sign,
+                     const Number* axis) {
+    Hull hull = hull_of(problem, env, b);
+    Vec at = transposed(rotation, vec(Real(sign * axis[0]), Real(sign * axis[1]), Real(sign * axis[2])));
+    Number x = plain(at.x), y = plain(at.y), z = plain(at.z), most = Number(PARALLEL);
+    int face = -1;
+    for (int i = 0; i < hull.faces; i++) {
+        const Number* n = problem.geometry.value + hull.row + 12LL * i;
+        Number along = x * n[0] + y * n[1] + z * n[2];
+        if (along > most) {
+            most = along;
+            face = i;
+        }
+    }
+    return face;
+}
+
+const int NEAR_ROOM = 32;
+struct Near {  // edges of a hull that are near another one; all of them where more are than there is room for
+    int count, listed[NEAR_ROOM];
+    INLINE int many(int ridges) const { return count < 0 ? ridges : count; }
+    INLINE int edge(int i) const { return count < 0 ? i : listed[i]; }
+    INLINE void add(int edge) {
+        if (count == NEAR_ROOM) count = -1;
+        if (count >= 0) listed[count++] = edge;
+    }
+    INLINE bool has(int edge) const {
+        bool found = count < 0;
+        for (int i = 0; i < count; i++) found = found || listed[i] == edge;
+        return found;
+    }
+};
+
+struct Parting {  // how two hulls part best
+    int on_a, on_b;  // faces that lie flat on each other, -1 for none: parallel to the face that parts them best
+    Number axis[3];  // normal of a face or of two edges along which the gap is largest, out of a
+    Number gap;      // no point of one hull is nearer to the other one
+    Mat turn;        // of the frame of b into that of a, with `shift`
+    Vec shift;
+    Near near_a, near_b;
+};
+
+// The edge of body b in the frame of body a.
+INLINE Edge edge_in(const Parting& parting, const Hull& hull_b, int i) {
+    return placed_edge(edge_of(hull_b, i), parting.turn, parting.shift);
+}
+
+// Whether an edge is farther than a margin from the box of a body's spheres, all in the frame of that body.
+INLINE bool edge_beside(const Constants& body, Vec start, Vec along, Number margin) {
+    const Number from[3] = {plain(start.x), plain(start.y), plain(start.z)};
+    const Number over[3] = {plain(along.x), plain(along.y), plain(along.z)};
+    for (int k = 0; k < 3; k++) {
+        Number to = from[k] + over[k];
+        if (lesser(from[k], to) > body.high[k] + margin || greater(from[k], to) < body.low[k] - margin) return true;
+    }
+    return false;
+}
+
+// Lists the edges of both hulls that are within a margin of the other body's box.
+INLINE void find_near(const Environment& env, int a, int b, const Hull& hull_a, const Hull& hull_b, Number margin,
+                      Parting& found) {
+    found.near_a.count = found.near_b.count = 0;
+    for (int i = 0; i < hull_a.ridges && found.near_a.count >= 0; i++) {
+        Edge edge = edge_of(hull_a, i);
+        Vec start = transposed(found.turn, edge.start - found.shift), along = transposed(found.turn, edge.along);
+        Number thick = plain(edge.radius) + greater(plain(edge.widening), Number(0));
+        if (!edge_beside(env.constants[b], start, along, margin + thick)) found.near_a.add(i);
+    }
+    for (int j = 0; j < hull_b.ridges && found.near_b.count >= 0; j++) {
+        Edge edge = edge_in(found, hull_b, j);
+        Number thick = plain(edge.radius) + greater(plain(edge.widening), Number(0));
+        if (!edge_beside(env.constants[a], edge.start, edge.along, margin + thick)) found.near_b.add(j);
+    }
+}
+
+// Gap between the hulls of two bodies along a unit vector of the world, out of a.
+INLINE Number gap_along(const Problem& problem, const Environment& env, int a, int b, const Mat* rotations,
+                        const Number* axis) {
+    Vec n = vec(Real(axis[0]), Real(axis[1]), Real(axis[2]));
+    Number ends[2];
+    for (int side = 0; side < 2; side++) {
+        int body = side ? b : a;
+        Hull hull = hull_of(problem, env, body);
+        Vec within = transposed(rotations[body], side ? -n : n);
+        Number x = plain(within.x), y = plain(within.y), z = plain(within.z), most = Number(-1e30);
+        for (int k = 0; k < hull.supports; k++) {
+            const Number* s = hull.support(k);
+            most = greater(most, x * s[0] + y * s[1] + z * s[2] + s[3]);
+        }
+        Vec origin = env.bodies[body].position - rotations[body] * env.constants[body].com;
+        ends[side] = most + (side ? -plain(dot(n, origin)) : plain(dot(n, origin)));
+    }
+    return -ends[1] - ends[0];
+}
+
+// Finds how the hulls of two bodies part best; false where they are not compared. Where a face parts them by more than
+// `limit`, edges are not looked at.
+__device__ bool part(const Problem& problem, const Environment& env, int p, const Mat* rotations, Number limit,
+                     Parting& found) {
+    int a = pair_a(p), b = pair_b(p);
+    found.on_a = found.on_b = -1;
+    if (face_count(a) == 0 || face_count(b) == 0) return false;
+    if (face_count(a) * support_count(b) + face_count(b) * support_count(a) > MOST_PLANES) return false;
+    found.gap = Number(-1e30);
+    found.axis[0] = found.axis[1] = Number(0);
+    found.axis[2] = Number(1);
+    part_by(problem, env, a, b, rotations, Number(1), found.gap, found.axis);
+    part_by(problem, env, b, a, rotations, Number(-1), found.gap, found.axis);
+    found.on_a = flat_face(problem, env, a, rotations[a], Number(1), found.axis);
+    found.on_b = flat_face(problem, env, b, rotations[b], Number(-1), found.axis);
+    if (contact_count(p) == sphere_count(a) + sphere_count(b) || found.gap > limit) return true;
+    const Hull hull_a = hull_of(problem, env, a), hull_b = hull_of(problem, env, b);
+    const Mat &R = rotations[a], &Q = rotations[b];
+    Mat turn = {R.x.x * Q.x + R.y.x * Q.y + R.z.x * Q.z, R.x.y * Q.x + R.y.y * Q.y + R.z.y * Q.z,
+                R.x.z * Q.x + R.y.z * Q.y + R.z.z * Q.z};
+    found.turn = turn;
+    found.shift = transposed(R, env.bodies[b].position - Q * env.constants[b].com - env.bodies[a].position);
+    found.shift = found.shift + env.constants[a].com;
+    find_near(env, a, b, hull_a, hull_b, limit + Number(SMOOTHING_M), found);
+    Number most = found.gap;
+    for (int n = 0; n < found.near_b.many(hull_b.ridges); n++) {
+        Edge second = edge_in(found, hull_b, found.near_b.edge(n));
+        for (int m = 0; m < found.near_a.many(hull_a.ridges); m++) {
+            Crossing crossing;
+            if (!cross_edges(edge_of(hull_a, found.near_a.edge(m)), second, crossing)) continue;
+            if (crossing.lean > Number(0) || !(plain(crossing.gap) > most)) continue;
+            most = plain(crossing.gap);
+            Vec normal = rotations[a] * crossing.normal;
+            found.axis[0] = plain(normal.x);
+            found.axis[1] = plain(normal.y);
+            found.axis[2] = plain(normal.z);
+        }
+    }
+    if (!(most > found.gap)) return true;
+    Number exact = gap_along(problem, env, a, b, rotations, found.axis);  // spheres beside the edges may protrude
+    // where edges part the bodies, faces that part them worse are not what touches
+    if (exact > found.gap + Number(FACE_SLACK_M)) found.on_a = found.on_b = -1;
+    found.gap = greater(found.gap, exact);
+    return true;
+}
+
+// Finds the contact of one slot of edges: where an edge of a comes over b, or where it leaves it.
+__device__ bool face_edges(const Problem& problem, const Environment& env, int p, int slot, const Mat* rotations,
+                           Number limit, const Parting& parting, Facing& facing) {
+    int a = pair_a(p);
+    if (!parting.near_a.has(slot / 2)) return false;
+    const Hull hull_b = hull_of(problem, env, pair_b(p));
+    Edge first = edge_of(hull_of(problem, env, a), slot / 2);
+    Vec axis = vec(Real(parting.axis[0]), Real(parting.axis[1]), Real(parting.axis[2]));
+    axis = transposed(rotations[a], axis);
+    // its normals are orthogonal to it
+    Number along = plain(dot(axis, first.along)), length2 = plain(dot(first.along, first.along));
+    if (along * along > Number(1 - PARALLEL * PARALLEL) * length2) return false;
+    Number least = limit;
+    int other = -1;
+    for (int n = 0; n < parting.near_b.many(hull_b.ridges); n++) {
+        Crossing crossing;
+        int j = parting.near_b.edge(n);
+        if (!cross_edges(first, edge_in(parting, hull_b, j), crossing)) continue;
+        if (!crossing.within || crossing.leaves != (slot % 2 == 1)) continue;
+        if (crossing.lean > Number(OUT_OF_FACE) || !(plain(dot(crossing.normal, axis)) > Number(PARALLEL))) continue;
+        if (!(plain(crossing.gap) < least)) continue;
+        least = plain(crossing.gap);
+        other = j;
+    }
+    if (other < 0) return false;
+    Crossing crossing;
+    cross_edges(first, edge_in(parting, hull_b, other), crossing);
+    Vec point = first.start + crossing.place * first.along +
+                (first.radius + crossing.place * first.widening + Number(0.5) * crossing.gap) * crossing.normal;
+    facing.gap = crossing.gap;
+    facing.sharp_gap = plain(crossing.gap);
+    facing.normal = -(rotations[a] * crossing.normal);
+    facing.point = env.bodies[a].position + rotations[a] * (point - env.constants[a].com);
+    return true;
+}
+#endif
+
+// Finds gap, normal and point of one slot of a pair of bodies: first come the spheres of b against the union of a, then
+// those of a against the union of b, then edges. Returns false if the gap exceeds `limit`. `known` is what is known of the
+// sphere's centre and the other body, if that was sought before.
+__device__ bool face(const Problem& problem, const Environment& env, int p, int k, const Mat* rotations, Number limit,
+                     const Parting& parting, const Nearness* known, Facing& facing) {
+#if HULLS
+    int spheres_in_all = sphere_count(pair_a(p)) + sphere_count(pair_b(p));
+    if (k >= spheres_in_all) {
+        return face_edges(problem, env, p, k - spheres_in_all, rotations, limit, parting, facing);
+    }
+#endif
+    bool second = k >= sphere_count(pair_b(p));
+    int mine = second ? pair_a(p) : pair_b(p), other = second ? pair_b(p) : pair_a(p);
+    Vec position = env.bodies[other].position;
+    long long row = env.geometry + 4LL * problem.spheres[contact_start(p) + k];
+    Vec center = env.bodies[mine].position + rotations[mine] * (problem.geometry.vector(row) - env.constants[mine].com);
+    Real radius = problem.geometry.at(row + 3);
+    Number around = size(center - position) - env.constants[other].reach - plain(radius) - Number(SMOOTHING_M);
+    if (!(around < limit)) return false;
+    Vec up = vec(Real(0), Real(0), Real(1));
+#if TURNED
+    up = env.turn * up;
+#endif
+    Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(other), sphere_count(other)};
+    Vec local = transposed(rotations[other], center - position) + env.constants[other].com, outward;
+    Real distance;
+    Number nearest = Number(0);
+    Number reached = limit + plain(radius);
+#if HULLS
+    if (face_count(other) > 0) {
+        Hull hull = hull_of(problem, env, other);
+        if (!distance_to_hull(hull, local, second ? parting.on_b : parting.on_a, reached, distance, nearest, outward)) return false;
+    } else
+#endif
+    {
+        up = transposed(rotations[other], up);
+        if (!union_distance(spheres, local, reached, up, known, distance, nearest, outward)) return false;
+    }
+    outward = rotations[other] * outward;
+    facing.gap = distance - radius;
+    facing.sharp_gap = nearest - plain(radius);
+    facing.normal = second ? outward : -outward;
+    facing.point = center - (radius + Number(0.5) * facing.gap) * outward;
+    return true;
+}
+#endif
