@@ -216,7 +216,7 @@ class SegmentsThresholds:
         "score of an effect that ranks first here and among slides",
         "development without an effect of contact: 276 real-like captures of three engines, 16 of six tosses, 17 of "
         "experiments in sequence",
-        "none of them is named, though 20 rank the same effect first in both; of 63 with an effect of contact 18 are "
+        "none of them is named, though 20 rank the same effect first in both; of 82 with an effect of contact 18 are "
         "named with this rule, 14 with a score of 40 and one parameter",
         (0, 309),
     )
