@@ -11,6 +11,7 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose import flight_selection, verdict
 from cgwm.pipeline.diagnose.alternative_laws import FrictionPyramid
 from cgwm.pipeline.diagnose.contact_search import Chosen
+from cgwm.pipeline.diagnose.contact_tests import sliding
 from cgwm.pipeline.diagnose.contact_tests.contact_test import selected
 from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
 from cgwm.pipeline.diagnose.effect_selection import SelectionStep
@@ -20,6 +21,7 @@ from cgwm.pipeline.diagnose.lasting_forces import without_lasting
 from cgwm.pipeline.diagnose.score_test import ScoreTest
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.diagnose.wording import _called, law_warnings
+from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.contact_law import Touch
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.friction_ellipse import Ellipse
@@ -144,6 +146,24 @@ def test_a_friction_pyramid_brakes_along_each_axis_by_itself(slip: tuple[float, 
     across = torch.tensor(slip).abs() > 0.02 * max(map(abs, slip))  # along an axis nothing pushes sideways
     torch.testing.assert_close(push[across], expected[across], rtol=0.03, atol=0.0)
     assert bool((push[~across].abs() < 0.1).all())
+
+
+def test_what_a_pyramid_explains_is_a_share_of_what_an_effect_explains(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fitted beside the friction and the states of the effect's own fit; whole slides: `make evidence`."""
+    world, tried = world_with("ball"), []
+
+    def fit_pyramid(found: World, variants: list[Any], starts: list[Any], known: object) -> list[Any]:
+        tried.append((found, variants, starts, known))
+        return [SimpleNamespace(cost=70.0)]
+
+    monkeypatch.setattr(sliding, "fit_sliding", fit_pyramid)
+    started: Any = SimpleNamespace(segments=SimpleNamespace(world=world), flight_parameters="known")
+    segments = SimpleNamespace(in_world=lambda found: ("segments in", found))
+    fit: Any = SimpleNamespace(values=torch.arange(5.0)[None], segments=segments, cost=40.0)
+    assert sliding.pyramid_share(started, SimpleNamespace(parameters=(1, 2)), fit, 100.0) == 0.5
+    ((found, variants, ((where, values),), known),) = tried
+    assert [type(one.effect) for one in found.effects] == [FrictionPyramid] and where == ("segments in", found)
+    assert variants == [] and values.tolist() == [0.0, 1.0, 2.0] and known == "known"
 
 
 def test_friction_by_direction_is_not_named_where_a_pyramid_explains_slides_as_well() -> None:
