@@ -85,10 +85,13 @@ def test_wrong_files_are_refused(own: Path, tmp_path: Path) -> None:
     assert refused(f"{tmp_path}/none.py:Lift") == (
         f"{tmp_path}/none.py: no such file.\nNext: write one with 'cgwm effects new FILE'."
     )
-    assert refused(str(own)) == f"{own}: names no class.\nAllowed: {own}:Lift."
-    assert refused(f"{own}:Lfit") == f"{own}:Lfit: has no class 'Lfit'.\nAllowed: {own}:Lift. Did you mean 'Lift'?"
+    name = "\nNext: name one of these classes after the colon."
+    assert refused(str(own)) == f"{own}: names no class.\nAllowed: {own}:Lift.{name}"
+    found = refused(f"{own}:Lfit")
+    assert found == f"{own}:Lfit: has no class 'Lfit'.\nAllowed: {own}:Lift. Did you mean 'Lift'?{name}"
     assert refused(f"{own}:Wrench") == (
         f"{own}:Wrench: not an effect.\nAllowed: a subclass of cgwm.pipeline.physics.effects.Effect."
+        "\nNext: derive the class from Effect, as 'cgwm effects new FILE.py' does."
     )
     own.write_text("x = 1\n")
     assert refused(f"{own}:Lift") == (
@@ -238,7 +241,10 @@ def test_the_template_overwrites_nothing(tmp_path: Path) -> None:
         new_effect(tmp_path / "new.py", overwrite=True)
     with pytest.raises(UsageError) as error:
         new_effect(tmp_path / "mine.txt")
-    assert str(error.value) == f"{tmp_path}/mine.txt: an effect is a Python file.\nAllowed: a name that ends with .py."
+    assert str(error.value) == (
+        f"{tmp_path}/mine.txt: an effect is a Python file.\nAllowed: a name that ends with .py.\n"
+        "Next: end the name with .py: cgwm effects new FILE.py."
+    )
 
 
 # The docs
