@@ -35,20 +35,23 @@ def bars(one: Evidence, sliding: tuple[str, ...] = (), flown: bool = False, expl
     return [bar.score for bar in SegmentsTest().bars([one], data)]
 
 
-@pytest.mark.parametrize("name", ["velocity_restitution", "ground_magnet", "rolling_resistance", "friction_patch"])
+IMITATED = ["velocity_restitution", "ground_magnet", "rolling_resistance", "friction_patch"]
+
+
+@pytest.mark.parametrize("name", [*IMITATED, "anisotropic_friction"])
 def test_segments_alone_do_not_name_what_laws_of_contact_imitate(name: str) -> None:
     assert bars(evidence(name, 1e6)) == []
     assert bars(evidence(name, 1e6), sliding=("stribeck_friction", name)) == []
 
 
-@pytest.mark.parametrize("name", ["viscous_friction", "anisotropic_friction"])
+@pytest.mark.parametrize("name", ["viscous_friction", "stribeck_friction"])
 def test_an_effect_that_ranks_first_among_slides_needs_less(name: str) -> None:
     alone = dict(LIMITS.alone)[name]
     assert bars(evidence(name)) == [alone]
     assert bars(evidence(name), sliding=(name,)) == [LIMITS.agreed_score, alone]
     assert LIMITS.agreed_score < alone
-    # nine numbers fit any law; slides cannot show a restitution, and follow a pull by friction
-    for other in ("friction_patch", "velocity_restitution", "ground_magnet"):
+    # two numbers and nine fit laws that they are not; slides cannot show a restitution, and follow a pull by friction
+    for other in ("anisotropic_friction", "friction_patch", "velocity_restitution", "ground_magnet"):
         assert bars(evidence(other), sliding=() if other == "ground_magnet" else (other,)) == []
     assert bars(evidence("adhesion"), sliding=("adhesion",)) == bars(evidence("adhesion")) != []
 
