@@ -185,7 +185,7 @@ def _extract(database: Path, root: Path, images: Sequence[SfmImage], settings: S
             image_path=root,
             image_names=[image.name for image in chunk],
             camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=_reader(chunk, _existing_camera(database, chunk[0].name)),
+            reader_options=_reader(chunk, _existing_camera(place, chunk[0].name)),
             extraction_options=options,
             device=pycolmap.Device.cpu,
             cancellation_token=token,

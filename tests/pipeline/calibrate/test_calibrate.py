@@ -325,11 +325,18 @@ def test_known_intrinsics_are_used_and_two_runs_give_the_same_bytes_on_any_numbe
     root, written = _fresh(scene, tmp_path, MANIFEST + MARKERS + KNOWN, photos=4), []
     monkeypatch.setattr(colmap, "_EXTRACTION_CHUNK", 1)
     monkeypatch.setattr(colmap, "_MATCHING_BLOCK", 2)
+    read, existing = [], colmap._existing_camera
+    monkeypatch.setattr(
+        colmap, "_existing_camera", lambda place, name: (read.append(place.name), existing(place, name))[1]
+    )
     for processors in (1, 3):
         for module in (attempts, colmap):
             monkeypatch.setattr(module, "processors", lambda count=processors: count)
+        read.clear()
         calibrate(root, CalibrateConfig(max_features=400), overwrite=processors > 1)
         written.append((root / "cameras.json").read_bytes())
+    # a thread reads its own copy: the database itself cannot be opened while another thread writes into it
+    assert any(".copy" in name for name in read)
     assert written[0] == written[1]
     camera = read_json(root / "cameras.json", CamerasFile).cameras["photos"]
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (420.0, 420.0, 200.0, 150.0, ())
