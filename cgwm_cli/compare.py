@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import Emit, loading
-from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, trust
+from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, require_warmup, trust
 from .verb import verb
 
 if TYPE_CHECKING:
@@ -49,14 +49,7 @@ def compare(
     trust(trust_effects)
     with loading():
         from ..pipeline.compare import compare as work
-    from ..schemas import UsageError
-
-    if not warmup_s > 0:
-        raise UsageError(
-            f"--warmup-s {warmup_s:g}: not a positive duration.",
-            "more than 0 s.",
-            "pass a duration in seconds, such as --warmup-s 0.1.",
-        )
+    require_warmup(warmup_s)
     from ..pipeline.compare.page import default_page
 
     page = out or default_page(models, split)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .execution import Emit, loading
-from .options import AcceptUnits, AnyDevice, TrustEffects, trust
+from .options import AcceptUnits, AnyDevice, TrustEffects, require_warmup, trust
 from .verb import verb
 
 if TYPE_CHECKING:
@@ -34,14 +34,7 @@ def evaluate(
     trust(trust_effects)
     with loading():
         from ..pipeline.evaluate import evaluate as work
-    from ..schemas import UsageError
-
-    if not warmup_s > 0:
-        raise UsageError(
-            f"--warmup-s {warmup_s:g}: not a positive duration.",
-            "more than 0 s.",
-            "pass a duration in seconds, such as --warmup-s 0.1.",
-        )
+    require_warmup(warmup_s)
     emit(work(model, target, split, warmup_s, device, accept_units), _summary)
 
 

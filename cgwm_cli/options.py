@@ -60,3 +60,15 @@ def trust(named: str) -> None:
         from ..pipeline.physics.effects.trust import trust_effects
 
         trust_effects(names)
+
+
+def require_warmup(warmup_s: float) -> None:
+    """Refuse a start that models may see if it is no positive duration."""
+    if not warmup_s > 0:
+        from ..schemas import UsageError
+
+        raise UsageError(
+            f"--warmup-s {warmup_s:g}: not a positive duration.",
+            "more than 0 s.",
+            "pass a duration in seconds, such as --warmup-s 0.1.",
+        )

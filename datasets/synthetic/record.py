@@ -97,8 +97,8 @@ class Set:
     still: float = 0.0
     """Bodies that have moved by no more than this, in metres and entries of quaternions, are not drawn anew."""
     tests_every: int = 1
-    """Of test videos the first two frames and every so manyth from the second on are drawn; those between repeat them:
-    the frames that `VideoErrors` with that number looks at."""
+    """Of test videos the first two frames are drawn, and then one in so many, which are those
+    that `VideoErrors` with that number looks at; those between repeat them."""
 
 
 def build_set(

@@ -159,13 +159,7 @@ def _without_outliers(model: SfmModel, limit_px: float) -> SfmModel:
     good = {image: errors_px(model, image) <= limit_px for image in model.T_cam_world}
     kept = {image: (xy[good[image]], seen[good[image]]) for image, (xy, seen) in model.observations.items()}
     count = np.bincount(np.concatenate([seen for _, seen in kept.values()]), minlength=len(model.points))
-    index = np.cumsum(count >= 2) - 1
-    observations = {}
-    for image, (pixels, seen) in kept.items():
-        of = count[seen] >= 2
-        observations[image] = (pixels[of], index[seen[of]])
-    many = count >= 2
-    return replace(model, points=model.points[many], colors=model.colors[many], observations=observations)
+    return replace(model, observations=kept).with_points(count >= 2)
 
 
 def _with_error(model: SfmModel) -> SfmModel:

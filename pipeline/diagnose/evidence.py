@@ -90,6 +90,11 @@ class Evidence:
         return max((abs(value) / scale[name] for name, (value, _) in self.estimates.items()), default=0.0)
 
     @property
+    def falls_at_rest(self) -> bool:
+        """Whether it is a friction at rest below that of sliding, which dry friction does not have."""
+        return self.name in THRESHOLDS.sliding.higher_at_rest and bool((self.test.estimate < 0).any())
+
+    @property
     def is_pyramid(self) -> bool:
         """Whether slides are explained as well by a friction pyramid, which has no number of its own."""
         return self.pyramid_share > THRESHOLDS.sliding.pyramid_share

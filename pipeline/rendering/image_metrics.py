@@ -31,7 +31,9 @@ def _window_means(values: Tensor) -> Tensor:
     """
     if values.is_cuda:
         return functional.avg_pool2d(values, _SSIM_WINDOW, 1, _SSIM_WINDOW // 2, count_include_pad=False)
-    inside = _window_sums(values.new_ones(values.shape[-2:]))
+    height, width = values.shape[-2:]
+    # how many pixels of a window are in the image: rows times columns
+    inside = _sums_along(values.new_ones(height, 1), -2) * _sums_along(values.new_ones(1, width), -1)
     return _WindowSums.apply(values) / inside  # type: ignore[operator]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -58,7 +58,7 @@ def draw(scene: TiledScene) -> TiledImages:
     alone = None
     if scene.groups:
         with torch.no_grad():
-            single = _Lists(**{**vars(lists), "min_transmittance": scene.group_transmittance})
+            single = replace(lists, min_transmittance=scene.group_transmittance)
             blank = scene.features[..., :0]
             members = [range(len(scene.scales))[group] for group in scene.groups]
             lefts = [_composited(centres, *spheres[1:3], blank, single, False, one)[1] for one in members]
@@ -113,6 +113,11 @@ class _Lists:
             min_transmittance=scene.min_transmittance,
         )
 
+    @property
+    def threads(self) -> int:
+        """Number of threads that composite them."""
+        return _threads(len(self.places) // PAIRS_PER_THREAD)
+
     def arguments(self, spheres: Sequence[Tensor], members: range) -> list[Tensor | int | float]:
         """Return the arguments LISTS of the program for spheres (centres, scales, log_opacities, features)."""
         _, scales, _, features = spheres
@@ -139,10 +144,11 @@ class _Composite(torch.autograd.Function):
         *spheres, out, left = ctx.saved_tensors
         lists: _Lists = ctx.lists
         found = [torch.zeros_like(x, memory_format=torch.contiguous_format) for x in spheres]
-        threads, pairs = _threads(len(lists.places) // PAIRS_PER_THREAD), len(lists.places)
+        pairs = len(lists.places)
         given = lists.arguments(spheres, range(len(spheres[1])))
         by_results = (gradient.contiguous() for gradient in gradients[:2])
-        _call(out.dtype == torch.float32, "composite_backward", threads, *given, out, left, *by_results, pairs, *found)
+        single = out.dtype == torch.float32
+        _call(single, "composite_backward", lists.threads, *given, out, left, *by_results, pairs, *found)
         return *found, None, None
 
 
@@ -160,9 +166,8 @@ def _composited(
     out = features.new_empty(*shape, features.shape[-1] + 1)
     left, middle = features.new_empty(shape), features.new_zeros(shape)
     given = lists.arguments((centres, scales, log_opacities, features), members)
-    threads = _threads(len(lists.places) // PAIRS_PER_THREAD)
     single = features.dtype == torch.float32
-    _call(single, "composite_forward", threads, *given, out, left, middle if median else None)
+    _call(single, "composite_forward", lists.threads, *given, out, left, middle if median else None)
     return out, left, middle
 
 

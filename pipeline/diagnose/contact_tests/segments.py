@@ -86,7 +86,7 @@ class SegmentsTest(ContactTest):
         best, shown, slides = equals[0], _first_of_slides(data), THRESHOLDS.sliding
         if len(best.candidate.effect.parameters) > self.limits.few_parameters or not repeats(best, 1):
             return ()
-        if best.name in slides.higher_at_rest and (best.test.estimate < 0).any():
+        if best.falls_at_rest:
             return ()
         found, hidden = [], best.name in (*slides.in_impacts_alone, *slides.as_friction)
         if shown is not None and shown.name == best.name and shown.score > self.limits.shown_score and not hidden:

@@ -97,11 +97,9 @@ class SlidingTest(ContactTest):
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bars for an effect, and for one that leaves next to nothing unexplained."""
         best = equals[0]
-        if best.name in self.limits.higher_at_rest and (best.test.estimate < 0).any():
+        if best.falls_at_rest or best.is_pyramid:
             return ()
         if data.sliding is not None and not _unexplained(data.sliding, self.limits.surplus_sigmas):
-            return ()
-        if best.is_pyramid:
             return ()
         parameters = len(best.candidate.effect.parameters)
         flexible = parameters > self.limits.few_parameters
