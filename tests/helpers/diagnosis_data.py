@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,10 +11,13 @@ from cgwm.datasets.capture.manifest import write_manifest
 from cgwm.datasets.capture.tracks import Track, write_tracks
 from cgwm.datasets.models.model import Model, write_model
 from cgwm.datasets.shapes.ply import Splats
+from cgwm.pipeline.diagnose.evidence import Evidence
+from cgwm.pipeline.diagnose.score_test import ScoreTest
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics import State, World
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.observation_model import measure
+from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import (
     CAPTURE_FORMAT,
@@ -112,3 +116,12 @@ def write_capture(root: Path, world: World, episodes: Sequence[tuple[str, dict[s
     model = root.with_name(f"{root.name}-model")
     write_model(model, Model(root=None, file=file, body_splats={}, collision={body.name: sphere}, scene=None))
     return model
+
+
+def evidence_of(name: str, values: Sequence[float] | None = None, **more: Any) -> Evidence:
+    """Return evidence of an admissible effect with estimates, by default all 1 with errors of 1, and further fields."""
+    effect = load_effect(name)
+    estimate = np.ones(len(effect.parameters)) if values is None else np.array(values)
+    size = len(estimate)
+    test = ScoreTest(statistic=1.0, dof=size, p_value=1.0, estimate=estimate, covariance=np.eye(size), admissible=True)
+    return Evidence(candidate=Candidate(name, effect), constants={}, test=test, p_value=1.0, **more)

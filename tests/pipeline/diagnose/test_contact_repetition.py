@@ -15,14 +15,13 @@ from cgwm.pipeline.diagnose.flight_equals import _undoubled, _with_scales_of_ses
 from cgwm.pipeline.diagnose.flight_findings import _Search
 from cgwm.pipeline.diagnose.group_values import _Scored, _unlike
 from cgwm.pipeline.diagnose.robust_fit import robust_repetition
-from cgwm.pipeline.diagnose.score_test import ScoreTest
 from cgwm.pipeline.diagnose.wording import noisy_warnings
-from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.parameters import Parameter
-from cgwm.pipeline.segments.candidates import Candidate, Variant
+from cgwm.pipeline.segments.candidates import Variant
 from cgwm.pipeline.segments.linearization import Linearization
 from cgwm.pipeline.segments.slow_errors import SlowErrors
 from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, NoiseModel
+from helpers.diagnosis_data import evidence_of
 from numpy.typing import NDArray
 
 
@@ -68,11 +67,7 @@ def test_what_another_law_leaves_is_scatter() -> None:
 
 
 def evidence(name: str, values: tuple[float, ...] = (1.0,)) -> Evidence:
-    size = len(values)
-    test = ScoreTest(
-        statistic=1.0, dof=size, p_value=1.0, estimate=np.array(values), covariance=np.eye(size), admissible=True
-    )  # fmt: skip
-    return Evidence(candidate=Candidate(name, load_effect(name)), constants={}, test=test, p_value=1.0, score=500.0)
+    return evidence_of(name, values, score=500.0)
 
 
 @pytest.mark.parametrize(("rise", "count"), [(0.2, 2), (-0.2, 0)])

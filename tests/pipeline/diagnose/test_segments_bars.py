@@ -4,29 +4,19 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from cgwm.pipeline.diagnose.contact_tests.segments import SegmentsTest
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.falsification import Repetition
-from cgwm.pipeline.diagnose.score_test import ScoreTest
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
-from cgwm.pipeline.physics.effects import load_effect
-from cgwm.pipeline.segments.candidates import Candidate
+from helpers.diagnosis_data import evidence_of
 
 LIMITS = THRESHOLDS.segments
 REPEATS = Repetition(1.0, 1e-6, 1e-3)
 
 
 def evidence(name: str, score: float = 300.0, share: float = 0.9) -> Evidence:
-    size = len(load_effect(name).parameters)
-    test = ScoreTest(
-        statistic=1.0, dof=size, p_value=1.0, estimate=np.ones(size), covariance=np.eye(size), admissible=True
-    )  # fmt: skip
-    candidate = Candidate(name, load_effect(name))
-    return Evidence(
-        candidate=candidate, constants={}, test=test, p_value=1.0, score=score, share=share, repetition=REPEATS
-    )
+    return evidence_of(name, score=score, share=share, repetition=REPEATS)
 
 
 def bars(one: Evidence, sliding: tuple[str, ...] = (), flown: bool = False, explained: bool = True) -> list[float]:

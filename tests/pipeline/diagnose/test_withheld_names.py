@@ -18,31 +18,23 @@ from cgwm.pipeline.diagnose.effect_selection import SelectionStep
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.flight_selection import FlightSelection
 from cgwm.pipeline.diagnose.lasting_forces import without_lasting
-from cgwm.pipeline.diagnose.score_test import ScoreTest
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.diagnose.wording import _called, law_warnings
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.contact_law import Touch
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.friction_ellipse import Ellipse
-from cgwm.pipeline.segments.candidates import Candidate, base_parameters
+from cgwm.pipeline.segments.candidates import base_parameters
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.segments.segment_fit import refit
 from cgwm.pipeline.trajectories.track_noise import Noise
-from helpers.diagnosis_data import tosses, world_with
+from helpers.diagnosis_data import evidence_of, tosses, world_with
 
 F64 = torch.float64
 
 
 def evidence(name: str, numbers: dict[str, tuple[float, float]] | None = None, **more: Any) -> Evidence:
-    size = len(load_effect(name).parameters)
-    test = ScoreTest(
-        statistic=1.0, dof=size, p_value=1.0, estimate=np.ones(size), covariance=np.eye(size), admissible=True
-    )  # fmt: skip
-    candidate = Candidate(name, load_effect(name))
-    return Evidence(
-        candidate=candidate, constants={}, test=test, p_value=1.0, score=1e4, share=0.9, numbers=numbers, **more
-    )
+    return evidence_of(name, score=1e4, share=0.9, numbers=numbers, **more)
 
 
 @pytest.mark.parametrize(

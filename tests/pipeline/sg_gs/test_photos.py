@@ -60,12 +60,17 @@ def _turned(view, twist):
     return replace(view, viewmat=viewmat, camera=camera)
 
 
+def with_gains(views):
+    """Return gains of channels (V, 3) by chance, and the photos with them."""
+    rng = np.random.default_rng(0)
+    gains = torch.tensor(np.exp(rng.normal(0, 0.15, (len(views), 3))), dtype=torch.float32)
+    return gains, [replace(view, image=view.image * gain) for view, gain in zip(views, gains, strict=True)]
+
+
 # In the suite: the next test: gains follow renders.
 @pytest.mark.evidence
 def test_gains_are_found_with_the_colours_up_to_their_mean(small, truth):
-    rng = np.random.default_rng(0)
-    gains = torch.tensor(np.exp(rng.normal(0, 0.15, (len(small), 3))), dtype=torch.float32)
-    darker = [replace(view, image=view.image * gain) for view, gain in zip(small, gains, strict=True)]
+    gains, darker = with_gains(small)
     exposures = Exposures(darker, True)
     start = replace(truth, colors=mean_colors(truth, darker))
     descend(Trainable(start, Rates(colors=0.03)), darker, scene_loss(None, exposures), 90, 0, "test")
@@ -80,9 +85,7 @@ def test_gains_are_found_with_the_colours_up_to_their_mean(small, truth):
 
 def test_gains_follow_renders_up_to_their_mean(small):
     """Of renders that are right but for the gain; with colours that are found meanwhile: `make evidence`."""
-    rng = np.random.default_rng(0)
-    gains = torch.tensor(np.exp(rng.normal(0, 0.15, (len(small), 3))), dtype=torch.float32)
-    darker = [replace(view, image=view.image * gain) for view, gain in zip(small, gains, strict=True)]
+    gains, darker = with_gains(small)
     exposures = Exposures(darker, True)
     wanted = gains / gains.log().mean(0).exp()
     for _ in range(60):
