@@ -1,20 +1,31 @@
-"""What a shadow that a moving body does not cast costs, in decibels.
+"""What the shadow of a moving body is worth, in decibels: where it is missing, and as a fitted model draws it.
 
 python benchmarks/shadows.py [--seeds N] [--frames N]
+python benchmarks/shadows.py --model MODEL [--scene fall] [--seed 0] [--frames N]
 
-The frames of the built-in scenes fall and push, ray cast twice: as they are, and with a ground that no body shades. The
-PSNR of one against the other is what a model could reach at most that is right in everything but the cast shadow:
-over the whole frame, and over the shadow alone (pixels of the ground that differ).
+Without a model: the frames of the built-in scenes fall and push, ray cast twice: as they are, and with a ground that no
+body shades. The PSNR of one against the other is what a model could reach at most that is right in everything but the
+cast shadow: over the whole frame, and over the shadow alone (pixels of the ground that differ).
+
+With a model that was fitted to a built-in scene: its pictures of the test episodes' true poses, with and without
+`synthesize.shadows`, against the ray-cast frames, whose brightness is fitted to the model's by one factor a channel.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
+from pathlib import Path
+from time import time_ns
 from typing import Any
 
 import numpy as np
+from cgwm.datasets.models.model import Model, read_model
 from cgwm.datasets.synthetic import plan_scene
+from cgwm.datasets.synthetic.dynamics import matrix_from_quat, quat_from_matrix
 from cgwm.datasets.synthetic.record import Set, _empty, build_set, frame_of
+from cgwm.pipeline.rendering.ground_shadow import shadow_of
+from cgwm.pipeline.rendering.label_renderer import LabelRenderer
 from store import Store
 
 GROUND_M = 1e-4
@@ -69,13 +80,72 @@ def measure(name: str, seeds: int, frames: int) -> dict[str, Any]:
     }
 
 
+def poses_of(model: Model, photo_qpos: np.ndarray, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (T, B, 3) [m] and quaternions (T, B, 4) of a model's bodies where the true object is at `qpos`.
+
+    The model's body lies in the photos where the true one does.
+    """
+    pose = model.file.bodies[0].photo_pose
+    turn = matrix_from_quat(photo_qpos[3:]).T @ matrix_from_quat(np.array(pose.quat_wxyz))
+    shift = matrix_from_quat(photo_qpos[3:]).T @ (np.array(pose.position_m) - photo_qpos[:3])
+    turns = [matrix_from_quat(row[3:7]) for row in qpos]
+    position = np.stack([row[:3] + R @ shift for row, R in zip(qpos, turns, strict=True)])
+    return position[:, None], np.stack([quat_from_matrix(R @ turn) for R in turns])[:, None]
+
+
+def measure_model(path: Path, name: str, seed: int, frames: int) -> dict[str, Any]:
+    """Return medians over frames of all cameras and test episodes of a scene."""
+    model, plan = read_model(path), plan_scene(name, seed)
+    scenes = [build_set(plan, (64, 48), (320, 240), 3) for _ in range(2)]
+    unshaded(scenes[1])
+    figures: dict[str, list[float]] = {key: [] for key in ("whole", "inside")}
+    gains, seconds = {"without": figures, "with": {key: [] for key in figures}}, {"without": 0.0, "with": 0.0}
+    for camera_name, filmed in scenes[0].videos.items():
+        camera = replace(filmed, distortion=np.zeros(0))
+        empty = _empty(scenes[0], camera)
+        for episode in [one for one in plan.episodes if one.split == "test"]:
+            times = np.linspace(0, episode.frame_count - 1, frames).astype(int) / plan.frame_rate
+            qpos = episode.motion.qpos[[episode.motion.row(time) for time in times]]
+            truths = [frame_of(scenes[0], camera, episode.motion, time, empty) for time in times]
+            flats = [frame_of(scenes[1], camera, episode.motion, time, empty)[0] for time in times]
+            for kind, shadow in (("without", None), ("with", shadow_of(model.file))):
+                renderer = LabelRenderer(model, {camera_name: camera}, shadow=shadow)
+                begun = time_ns()
+                blocks = list(renderer.blocks(*poses_of(model, plan.photo_qpos, qpos[:, :7])))
+                seconds[kind] += (time_ns() - begun) / 1e9
+                pictures = np.concatenate([block.image for block in blocks]) / 255
+                for picture, (truth, label), flat in zip(pictures, truths, flats, strict=True):
+                    lit = (label == 0) & (np.abs(truth - flat).max(-1) < 1 / 255)
+                    seen = picture * (truth[lit].sum(0) / picture[lit].sum(0))
+                    cast = (np.abs(truth - flat).max(-1) > 1 / 255) & (label == 0)
+                    gains[kind]["whole"].append(psnr(truth, seen))
+                    if cast.sum() > 20:
+                        gains[kind]["inside"].append(psnr(truth[cast], seen[cast]))
+    counted = len(figures["whole"])
+    return {
+        "frames": counted,
+        **{f"whole_frame_{k}_db": float(np.median(v["whole"])) for k, v in gains.items()},
+        **{f"in_the_shadow_{k}_db": float(np.median(v["inside"])) for k, v in gains.items()},
+        "better_frames": int((np.array(gains["with"]["inside"]) > gains["without"]["inside"]).sum()),
+        "frames_with_a_shadow": len(gains["with"]["inside"]),
+        **{f"ms_a_frame_{kind}": 1e3 * spent / counted for kind, spent in seconds.items()},
+    }
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--frames", type=int, default=5, help="of each camera and episode")
+    parser.add_argument("--model", type=Path, help="fitted to a built-in scene")
+    parser.add_argument("--scene", default="fall", choices=("fall", "push"), help="of the model")
+    parser.add_argument("--seed", type=int, default=0, help="of the model's scene")
     options = parser.parse_args()
     store = Store("shadows")
+    if options.model is not None:
+        found = measure_model(options.model, options.scene, options.seed, options.frames)
+        store.add(f"model of {options.scene} {options.seed}", found)
+        return
     for name in ("fall", "push"):
         store.add(name, measure(name, options.seeds, options.frames))
 

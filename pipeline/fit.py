@@ -351,6 +351,7 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
             for body, fitted in zip(capture.manifest.bodies, bodies, strict=True)
             for p in _mass_parameters(body, fitted)
         ),
+        ground_shadow=scene.ground_shadow,
         warnings=tuple(warnings),
         provenance=Provenance(capture=capture.root.name),
     )

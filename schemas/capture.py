@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -27,6 +26,7 @@ from .quantities import (
     Mass,
     Position3,
     Vector3,
+    unit_vector,
 )
 from .surfaces import Surface
 
@@ -74,10 +74,7 @@ class Ground(FileModel):
     @field_validator("normal")
     @classmethod
     def _unit(cls, value: Vector3) -> Vector3:
-        norm = math.hypot(*value)
-        if abs(norm - 1.0) > 1e-3:
-            raise ValueError(f"the ground normal has length {norm:.4f}; it must be 1")
-        return value[0] / norm, value[1] / norm, value[2] / norm
+        return unit_vector(value, "the ground normal")
 
 
 class World(FileModel):

@@ -133,6 +133,8 @@ class SynthesizeConfig(FileModel):
     compression: Literal["zstd", "gzip", "none", "jpeg"] = "zstd"
     """Of images, depth and masks: lossless; `jpeg` is zstd but for the colours, which lose a little and take a third of
     the room."""
+    shadows: bool = False
+    """Whether moving bodies cast a shadow on the ground, under the lamp that photos or videos told."""
     batch: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Rollouts that are drawn and simulated together; it changes no byte. Left out, 64 on a GPU, 1 on
     the CPU."""

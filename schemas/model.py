@@ -23,6 +23,8 @@ from .quantities import (
     Position3,
     RadiusFactor,
     Step,
+    Vector3,
+    unit_vector,
 )
 from .surfaces import Surface
 
@@ -41,6 +43,7 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
 NonNegative = Annotated[float, Field(ge=0, le=1e30)]
 Value = Annotated[float, Field(ge=-1e30, le=1e30)]
 Interval = Annotated[tuple[Value, Value], AfterValidator(_ordered)]
+Brightness = Annotated[float, Field(ge=0, le=1)]
 Colour3 = tuple[Colour, Colour, Colour]
 ROUNDING = 1e-6
 """Largest relative difference of numbers that are the same but for rounding."""
@@ -230,6 +233,20 @@ class Light(FileModel):
     """How much brighter the room is from above than from its side, relative to its mean [1]."""
 
 
+class GroundShadow(FileModel):
+    """The shadow that bodies cast on the ground under one lamp far away."""
+
+    to_lamp: Vector3
+    """Unit vector to the lamp, world frame."""
+    brightness_rgb: tuple[Brightness, Brightness, Brightness]
+    """Brightness in the shadow over that outside, by colour channel [1]."""
+
+    @field_validator("to_lamp")
+    @classmethod
+    def _unit(cls, value: Vector3) -> Vector3:
+        return unit_vector(value, "the direction to the lamp")
+
+
 class Provenance(FileModel):
     """Where the model comes from."""
 
@@ -274,6 +291,8 @@ class ModelFile(FileModel):
     """By video camera."""
     light: Light | None = None
     """Where the videos tell it; None leaves a body in the light of the photos, however it turns."""
+    ground_shadow: GroundShadow | None = None
+    """As found in the photos; None where none stands out."""
     warnings: tuple[str, ...] = ()
     provenance: Provenance
 

@@ -55,6 +55,14 @@ RadiusFactor = Annotated[float, Field(ge=0.01, le=100)]
 """Collision radius of a sphere in units of its Gaussian scale [1]."""
 
 
+def unit_vector(value: Vector3, what: str) -> Vector3:
+    """Return a vector with a length of exactly 1, or raise a ValueError unless it is 1 within 0.001."""
+    norm = math.hypot(*value)
+    if not abs(norm - 1.0) <= 1e-3:
+        raise ValueError(f"{what} has length {norm:.4f}; it must be 1")
+    return value[0] / norm, value[1] / norm, value[2] / norm
+
+
 def _unlike_any_planet(value: Vector3) -> Vector3:
     if math.hypot(*value) > MAX_GRAVITY_M_S2:
         raise ValueError(f"gravity of {math.hypot(*value):g} m/s2; at most {MAX_GRAVITY_M_S2:g} m/s2")

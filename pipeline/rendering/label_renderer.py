@@ -25,7 +25,8 @@ from ...datasets.io.processors import processors
 from ...datasets.models.model import Model
 from ...datasets.rollouts.chunks import CHUNK_FRAMES
 from ...datasets.rollouts.rollouts import FrameBlock, amodal_dtype
-from ...schemas import Exposure, Light
+from ...schemas import Exposure, GroundShadow, Light
+from .ground_shadow import ShadedGround
 from .posed_scene import Labelled, LabelledModel
 from .render import RenderOutput, render
 from .screen_bounds import TILE, Box, inside, reach, spans
@@ -91,22 +92,38 @@ class LabelRenderer:
         model: A model with visual spheres.
         cameras: The cameras by name.
         device: Device on which to render.
+        shadow: Shadow that moving bodies cast on the ground; None for none.
     """
 
-    def __init__(self, model: Model, cameras: Mapping[str, Camera], device: str = "cpu"):
+    def __init__(
+        self,
+        model: Model,
+        cameras: Mapping[str, Camera],
+        device: str = "cpu",
+        shadow: GroundShadow | None = None,
+    ):
         self._scene = LabelledModel(model, device)
         self._together = torch.device(device).type == "cuda"
         self._amodal_dtype = amodal_dtype(self._scene.bodies)
         self._threads = ThreadPoolExecutor(processors(), "cgwm-render")
+        self._ground, self._shadow = model.file.ground, shadow
+        self._shaded: ShadedGround | None = None
         self.set_cameras(cameras)
 
     def set_cameras(self, cameras: Mapping[str, Camera]) -> None:
         """Replace the cameras."""
         self._views = {name: self._view(camera) for name, camera in cameras.items()}
+        self.set_shadow(self._shadow)
 
     def set_light(self, light: Light | None) -> None:
         """Set the light that shades moving bodies; None keeps the colours of the photos."""
         self._scene.set_light(light)
+
+    def set_shadow(self, shadow: GroundShadow | None) -> None:
+        """Set the shadow that moving bodies cast on the ground; None for none."""
+        self._shadow, self._shaded = shadow, None
+        if shadow is not None and self._ground is not None and self._views:
+            self._shaded = ShadedGround(shadow, self._ground, next(iter(self._views.values())).still)
 
     @torch.no_grad()
     def blocks(
@@ -176,19 +193,19 @@ class LabelRenderer:
     def _all_at_once(self, placed: Sequence[tuple[int, Labelled]], count: int) -> dict[str, _Pictures]:
         """Return the labels of `count` frames for each camera; cameras of equal size are rendered in one call."""
         found: dict[str, _Pictures] = {}
+        dimming = torch.ones(0) if self._shaded is None else self._shaded.dimming(placed)
         order = sorted(self._views, key=lambda name: _size(self._views[name].camera))
         for size, group in groupby(order, key=lambda name: _size(self._views[name].camera)):
             names = list(group)
             views = [self._views[name] for name in names]
             viewmats = torch.stack([view.viewmat for view in views]).repeat_interleave(count, 0)
             Ks = torch.stack([view.K for view in views]).repeat_interleave(count, 0)
-            still = Labelled(
-                means=views[0].still.means,
-                scales=views[0].still.scales,
-                opacities=views[0].still.opacities,
+            still = replace(
+                views[0].still,
                 colors=torch.stack([view.still.colors for view in views]).repeat_interleave(count, 0),
-                labels=views[0].still.labels,
             )
+            if self._shaded is not None:
+                still = self._shaded.shaded(still, dimming.repeat(len(views), 1, 1))
             eyes = torch.stack([self._scene.tensor(view.camera.center) for view in views])
             moving = [(body, spheres.seen_from(eyes)) for body, spheres in placed]
             alone = torch.stack([view.alone for view in views]).repeat_interleave(count, 0)
@@ -208,8 +225,9 @@ class LabelRenderer:
         for camera, plate in plates.items():
             made[camera] = {name: getattr(plate.labels, name).repeat_interleave(count, 0) for name in names}
         tasks = [(camera, frame) for camera in plates for frame in range(count)]
+        shades = [None] * count if self._shaded is None else [*self._shaded.dimming(placed)]
         crops = self._threads.map(
-            lambda task: self._crop(self._views[task[0]], plates[task[0]], placed, task[1]), tasks
+            lambda task: self._crop(self._views[task[0]], plates[task[0]], placed, task[1], shades[task[1]]), tasks
         )
         for (camera, frame), crop in zip(tasks, crops, strict=True):
             if crop is not None:
@@ -221,16 +239,28 @@ class LabelRenderer:
 
     @torch.no_grad()
     def _crop(
-        self, view: _View, plate: _Plate, placed: Sequence[tuple[int, Labelled]], frame: int
+        self,
+        view: _View,
+        plate: _Plate,
+        placed: Sequence[tuple[int, Labelled]],
+        frame: int,
+        dimming: Tensor | None,
     ) -> tuple[Box, _Pictures] | None:
-        """Return the box that moving bodies can reach in one frame, and its labels; None where they reach no pixel."""
+        """Return the box that moving bodies can reach in one frame, and its labels; None where they reach no pixel.
+
+        The factors `dimming` (R, 3) are those of the spheres of the ground that bodies shade.
+        """
         eye = self._scene.tensor(view.camera.center)[None]
         moving = [(body, spheres.view(frame).seen_from(eye)) for body, spheres in placed]
         bodies = Labelled.joined([self._scene.none, *(spheres for _, spheres in moving)])
-        box = reach(bodies, view.viewmat, view.K, view.camera.width, view.camera.height)
+        reaches, still = spans(bodies, view.viewmat, view.K), view.still
+        if dimming is not None and self._shaded is not None:
+            still = self._shaded.shaded(still, dimming)
+            reaches = torch.cat([reaches, plate.reaches[self._shaded.rows[self._shaded.visible(dimming)]]])
+        box = reach(reaches, view.camera.width, view.camera.height)
         if box is None:
             return None
-        near = view.still.rows(inside(plate.reaches, box))
+        near = still.rows(inside(plate.reaches, box))
         viewmats, Ks = view.viewmat[None], box.camera_matrix(view.K)[None]
         return box, self._labels(moving, near, viewmats, Ks, box, view.alone[box.place][None])
 

@@ -69,11 +69,10 @@ def spans(spheres: Labelled, viewmat: Tensor, K: Tensor) -> Tensor:
     return torch.stack([columns[0], columns[2], columns[1], columns[3]], 1)
 
 
-def reach(spheres: Labelled, viewmat: Tensor, K: Tensor, width: int, height: int) -> Box | None:
-    """Return the box, on tile borders, outside of which no sphere reaches MIN_ALPHA; None for an empty box."""
-    if len(spheres) == 0:
+def reach(each: Tensor, width: int, height: int) -> Box | None:
+    """Return the box, on tile borders, around `spans` (N, 4) of spheres; None for an empty box."""
+    if len(each) == 0:
         return None
-    each = spans(spheres, viewmat, K)
     low, high = each[:, :2].amin(0).tolist(), each[:, 2:].amax(0).tolist()
     limits = []
     for first, last, size in zip(low, high, (width, height), strict=True):

@@ -7,7 +7,7 @@ ground, and what no photo shows would have any colour.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from ...datasets.io.progress import note
+from ...schemas import GroundShadow
 from ..geometry.solid_grid import Array
 from ..geometry.spheres import Spheres
 from .cast_shadow import CastShadow, find_shadow
@@ -34,7 +35,16 @@ _SPACING_CELLS, _SCALE_CELLS = 2, 1.3
 _GAP_CELLS = 2
 
 
-def bare_ground(stage: Stage, scene: Spheres, bodies: list[Spheres]) -> Spheres:
+class BareGround(NamedTuple):
+    """A background without the traces of the bodies that move."""
+
+    scene: Spheres
+    """The background."""
+    shadow: GroundShadow | None
+    """The shadow that was lifted; None if none stands out."""
+
+
+def bare_ground(stage: Stage, scene: Spheres, bodies: list[Spheres]) -> BareGround:
     """Return the background with the ground under and beside the bodies as it is without them.
 
     Args:
@@ -43,12 +53,12 @@ def bare_ground(stage: Stage, scene: Spheres, bodies: list[Spheres]) -> Spheres:
         bodies: Visual spheres of the bodies as they stand in the photos, world frame.
     """
     if stage.ground is None or not bodies:
-        return scene
+        return BareGround(scene, None)
     solid = [_outline(body) for body in bodies]
     even = [stage.exposures.even(view) for view in stage.train]
     photo = photograph_ground(stage.ground, np.concatenate(solid), even)
     if photo is None:
-        return scene
+        return BareGround(scene, None)
     shadow = find_shadow(photo, solid)
     hidden = _hidden(photo, solid)
     lit = photo.colors if shadow is None else photo.colors / _dimming(shadow.cover, shadow.factors)
@@ -58,7 +68,13 @@ def bare_ground(stage: Stage, scene: Spheres, bodies: list[Spheres]) -> Spheres:
     scene = _filled(scene, photo, hidden, bare)
     stage.record["bare_ground"] = _record(photo, hidden, shadow)
     note(f"sg-gs: {_said(photo, hidden, shadow)}")
-    return scene
+    return BareGround(scene, None if shadow is None else _for_model(shadow))
+
+
+def _for_model(shadow: CastShadow) -> GroundShadow:
+    x, y, z = map(float, shadow.to_lamp)
+    red, green, blue = map(float, shadow.factors)
+    return GroundShadow(to_lamp=(x, y, z), brightness_rgb=(red, green, blue))
 
 
 def _outline(body: Spheres) -> Array:

@@ -10,7 +10,7 @@ from ...datasets.capture.cameras import posed
 from ...datasets.capture.capture import Capture
 from ...datasets.io.progress import note
 from ...datasets.shapes.ply import Splats
-from ...schemas import CamerasFile, InputDataError, SplatConfig, UsageError
+from ...schemas import CamerasFile, GroundShadow, InputDataError, SplatConfig, UsageError
 from ..geometry.spheres import Spheres
 from ..rendering.contact_sheets import SHEET_BYTES, separated, small_png
 from ..runtime.checkpoint import Checkpoint
@@ -40,6 +40,8 @@ class SgGsResult:
     """Background spheres, world frame, or None without photos."""
     radius_factor: float
     """Collision radius in units of the Gaussian scale."""
+    ground_shadow: GroundShadow | None = None
+    """The shadow that bodies cast in the photos, or None if none was found."""
     record: dict[str, Any]
     """Losses, timings and held-out figures, for fit.json."""
     warnings: tuple[str, ...] = ()
@@ -84,14 +86,16 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
     scene = fit_background(stage, placed) if stage.train else None
     if stage.train:
         pictures |= _checked(stage, placed, scene)
+    shadow = None
     if scene is not None and config.bare_ground:
         moving = [body.name for body in capture.manifest.bodies if body.motion != "fixed"]
-        scene = bare_ground(stage, scene, [spheres for name, spheres in standing.items() if name in moving])
+        scene, shadow = bare_ground(stage, scene, [spheres for name, spheres in standing.items() if name in moving])
     stage.record["seconds"] = round(time.perf_counter() - started, 2)
     return SgGsResult(
         bodies=results,
         scene=None if scene is None else scene.to_numpy(),
         radius_factor=config.radius_factor,
+        ground_shadow=shadow,
         record=stage.record,
         warnings=tuple(stage.warnings),
         pictures=pictures,

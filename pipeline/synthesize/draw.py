@@ -11,7 +11,9 @@ import numpy as np
 from ...datasets.capture.cameras import Camera
 from ...datasets.models.model import Model
 from ...datasets.rollouts.rollouts import RolloutParameter
-from ...schemas import Exposure, Light, ModelFile, SamplingPlan, SynthesizeConfig
+from ...schemas import Exposure, GroundShadow, Light, ModelFile, SamplingPlan, SynthesizeConfig
+from ...schemas.quantities import Vector3
+from ..rendering.ground_shadow import shadow_of
 from .distributions import draw
 from .parameters import draw_parameters
 from .plan import up_direction
@@ -92,6 +94,8 @@ class Lighting:
     """Brightness of the light relative to the photos by colour channel [1], shape (3,)."""
     exposures: dict[str, Exposure]
     """Exposure by camera: its image is gain * picture + offset, including the gain of the light."""
+    shadow: GroundShadow | None
+    """Shadow that moving bodies cast on the ground under the lamp; None if the model tells none."""
 
     @property
     def plain(self) -> bool:
@@ -112,13 +116,11 @@ def draw_lighting(
         rng: Source of randomness.
     """
     light, angle = file.light, math.radians(draw(plan.light_turn_deg, rng))
+    shadow = shadow_of(file)
     if light is not None and angle:
-        lamp = np.asarray(light.lamp)
-        # Rodrigues' formula for the unit vector `up`
-        turned = (
-            lamp * math.cos(angle) + np.cross(up, lamp) * math.sin(angle) + up * (up @ lamp) * (1 - math.cos(angle))
-        )
-        light = light.model_copy(update={"lamp": (float(turned[0]), float(turned[1]), float(turned[2]))})
+        light = light.model_copy(update={"lamp": _turned(light.lamp, up, angle)})
+    if shadow is not None and angle:
+        shadow = shadow.model_copy(update={"to_lamp": _turned(shadow.to_lamp, up, angle)})
     gain = draw(plan.light_gain, rng) * np.array([draw(plan.light_tint, rng) for _ in range(3)])
     exposures = {}
     for name in cameras:
@@ -127,4 +129,11 @@ def draw_lighting(
         exposures[name] = Exposure(
             gain_rgb=(float(own[0]), float(own[1]), float(own[2])), offset_rgb=(offset, offset, offset)
         )
-    return Lighting(light, gain, exposures)
+    return Lighting(light, gain, exposures, shadow)
+
+
+def _turned(vector: Vector3, up: np.ndarray, angle: float) -> Vector3:
+    """Return a vector turned by an angle [rad] about the unit vector `up` (Rodrigues' formula)."""
+    v = np.asarray(vector)
+    x, y, z = v * math.cos(angle) + np.cross(up, v) * math.sin(angle) + up * (up @ v) * (1 - math.cos(angle))
+    return float(x), float(y), float(z)

@@ -16,6 +16,7 @@ from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.shards import shard_range
 from ...schemas import DatasetManifest, InputDataError, ModelFile, SamplingPlan, SynthesizeConfig, UsageError
 from ..physics.world import World
+from ..rendering.ground_shadow import shadow_of
 from ..rendering.label_renderer import LabelRenderer
 from ..runtime.device import resolve_device
 from ..runtime.work_budget import within_budget
@@ -127,6 +128,8 @@ def _job(model: Model, plan: SamplingPlan, config: SynthesizeConfig, device: str
     """Allocate what all rollouts of a shard share."""
     cameras = look_at_cameras(model, plan, config) if model.body_splats else {}
     renderer = LabelRenderer(model, cameras, device) if model.body_splats else None
+    if config.shadows:
+        _require_shadow(model)
     times = np.arange(count) / config.frame_rate_hz
     simulator, rejection = Simulator(model, times, device), Rejection.of(model, plan.reject)
     return Job(
@@ -140,6 +143,25 @@ def _job(model: Model, plan: SamplingPlan, config: SynthesizeConfig, device: str
         rejection=rejection,
         device=device,
     )
+
+
+def _require_shadow(model: Model) -> None:
+    """Refuse shadows that the model cannot cast.
+
+    Raises:
+        InputDataError: If no lamp is known, or no ground can be seen.
+    """
+    lacking = (
+        "no body has visual spheres" if not model.body_splats
+        else "it has no background" if model.scene is None
+        else "neither its photos nor its videos tell where the lamp is" if shadow_of(model.file) is None
+        else None
+    )  # fmt: skip
+    if lacking is not None:
+        raise InputDataError(
+            f"{model.root}: synthesize.shadows is set, and no shadow can be cast: {lacking}.",
+            todo="leave synthesize.shadows out, or fit the model from photos with a cast shadow or from videos.",
+        )
 
 
 @contextmanager

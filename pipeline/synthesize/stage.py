@@ -246,6 +246,8 @@ def _frames(job: Job, draw: Draw, labels: RolloutLabels, stopwatch: Stopwatch) -
             job.renderer.set_cameras(draw.cameras)
         if job.plan.light_turn_deg.support != (0.0, 0.0) and draw.lighting.light is not None:
             job.renderer.set_light(draw.lighting.light)
+        if job.config.shadows:
+            job.renderer.set_shadow(draw.lighting.shadow)
         exposures = None if draw.lighting.plain else draw.lighting.exposures
         blocks = job.renderer.blocks(labels.position_m, labels.quat_wxyz, wait=False, exposures=exposures)
     while True:

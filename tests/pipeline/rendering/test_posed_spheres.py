@@ -87,7 +87,7 @@ def test_a_crop_is_made_of_whole_tiles_and_holds_what_is_seen() -> None:
     one = spheres(3, 1)
     means = torch.tensor([[0.05, 0.02, 1.0], [-0.1, 0.1, 1.0], [0.0, -0.05, 1.0]])
     near = replace(one, means=means, scales=torch.full((3,), 0.01), opacities=torch.full((3,), 0.9))
-    box = reach(near, torch.eye(4), K, WIDTH, HEIGHT)
+    box = reach(spans(near, torch.eye(4), K), WIDTH, HEIGHT)
     assert box is not None
     each = spans(near, torch.eye(4), K)
     low, high = each[:, :2].amin(0), each[:, 2:].amax(0)
@@ -99,10 +99,10 @@ def test_a_crop_is_made_of_whole_tiles_and_holds_what_is_seen() -> None:
     shifted = box.camera_matrix(K)
     assert (K - shifted)[:2, 2].tolist() == [box.left, box.top] and shifted[0, 0] == K[0, 0]
     for shift in ([5.0, 0.0, 0.0], [-5.0, 0.0, 0.0], [0.0, 5.0, 0.0], [0.0, -5.0, 0.0]):
-        assert reach(replace(near, means=means + torch.tensor(shift)), torch.eye(4), K, WIDTH, HEIGHT) is None
-    assert reach(near.rows(slice(0, 0)), torch.eye(4), K, WIDTH, HEIGHT) is None
+        assert reach(spans(replace(near, means=means + torch.tensor(shift)), torch.eye(4), K), WIDTH, HEIGHT) is None
+    assert reach(spans(near.rows(slice(0, 0)), torch.eye(4), K), WIDTH, HEIGHT) is None
     around = replace(near, means=means * 0.01)
-    assert reach(around, torch.eye(4), K, WIDTH, HEIGHT) == Box(0, 0, WIDTH, HEIGHT)
+    assert reach(spans(around, torch.eye(4), K), WIDTH, HEIGHT) == Box(0, 0, WIDTH, HEIGHT)
     edge = Box(8, 16, 24, 32)
     reached = [[0, 0, 8, 16], [24, 32, 40, 40], [0, 0, 7.9, 40], [0, 0, 40, 15.9], [24.1, 0, 40, 40], [0, 32.1, 40, 40]]
     assert inside(torch.tensor(reached), edge).tolist() == [True, True, False, False, False, False]

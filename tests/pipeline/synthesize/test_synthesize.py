@@ -27,6 +27,7 @@ from cgwm.schemas import (
     EffectModel,
     Exposure,
     FittedParameter,
+    GroundShadow,
     InputDataError,
     Light,
     NotConvergedError,
@@ -37,6 +38,7 @@ from cgwm.schemas import (
 from helpers.small_model import HALF, MASS, cube_splats, small_model, write_small_model
 from scipy import stats
 
+SHADOW = GroundShadow(to_lamp=(0.48, 0.0, 0.877268), brightness_rgb=(0.5, 0.6, 0.7))
 CONFIG = SynthesizeConfig(rollouts=2, duration_s=0.3, width=64, height=48, device="cpu", seed=5)
 
 
@@ -158,17 +160,35 @@ def test_the_pusher_comes_at_the_object(tmp_path: Path) -> None:
     reader.close()
 
 
+def test_shadows_change_colours_alone_and_need_a_lamp(dataset: Path, model_path: Path, tmp_path: Path) -> None:
+    config = CONFIG.model_copy(update={"shadows": True})
+    with pytest.raises(InputDataError, match="neither its photos nor its videos tell where the lamp is"):
+        synthesize(model_path, tmp_path / "none", config)
+    model = small_model()
+    lit = model.file.model_copy(update={"ground_shadow": SHADOW})
+    write_model(tmp_path / "model", replace(model, file=lit))
+    synthesize(tmp_path / "model", tmp_path / "shaded", config)
+    plain, shaded = RolloutReader(dataset), RolloutReader(tmp_path / "shaded")
+    for key in ("view0_mask", "view0_depth", "view0_amodal"):
+        np.testing.assert_array_equal(plain.read(0, f"obs/{key}"), shaded.read(0, f"obs/{key}"))
+    change = shaded.read(0, "obs/view0_image").astype(int) - plain.read(0, "obs/view0_image")
+    dark = change.min(-1) < -5
+    assert dark.mean() > 0.005 and change.max() <= 1
+    assert (plain.read(0, "obs/view0_mask")[dark] == 0).mean() > 0.9
+    plain.close(), shaded.close()
+
+
 def test_crops_are_the_whole_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     model = small_model(driven=True)
     plan = resolve_plan(model, SamplingPlan())
     cameras = look_at_cameras(model, plan, SynthesizeConfig(width=100, height=76))
-    renderer = LabelRenderer(model, cameras)
+    renderer = LabelRenderer(model, cameras, shadow=SHADOW)
     rng = np.random.default_rng(0)
     position = rng.uniform(-0.25, 0.25, (6, 2, 3)) + np.array([0, 0, 0.2])
     quat = rng.normal(size=(6, 2, 4))
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     crops = list(renderer.blocks(position, quat))
-    monkeypatch.setattr(labels_module, "reach", lambda spheres, viewmat, K, width, height: Box(0, 0, width, height))
+    monkeypatch.setattr(labels_module, "reach", lambda each, width, height: Box(0, 0, width, height))
     for crop, whole in zip(crops, renderer.blocks(position, quat), strict=True):
         np.testing.assert_array_equal(crop.image, whole.image)
         np.testing.assert_array_equal(crop.mask, whole.mask)
@@ -218,7 +238,7 @@ def test_all_at_once_is_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     position = rng.uniform(-0.1, 0.1, (11, 3, 3)) + np.array([0, 0, 0.15])
     quat = rng.normal(size=(11, 3, 4))
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
-    renderer = LabelRenderer(model, cameras)
+    renderer = LabelRenderer(model, cameras, shadow=SHADOW)
     expected = list(renderer.blocks(position, quat))
     monkeypatch.setattr(labels_module, "_to_host", lambda pictures: (pictures, lambda: None))
     monkeypatch.setattr(renderer, "_together", True)
