@@ -26,6 +26,8 @@ class Mutant:
     """The file, relative to the tree."""
     line: int
     """Line of the change, from 1."""
+    statement: int
+    """First line of the statement; that of the change may have no instruction of its own."""
     kind: str
     """What is changed: operator, comparison, number, condition, return, call."""
     begin: int
@@ -52,7 +54,15 @@ class Changes(ast.NodeVisitor):
         self.path, self.source, self.found = path, source, []
         self.starts = [0, *(match.end() for match in re.finditer(b"\n", source))]
         self.scope: list[str] = []
-        self.inside = 0
+        self.inside = self.statement = 0
+
+    def visit(self, node: ast.AST) -> None:
+        """Visit a node, and note the statement that it belongs to."""
+        before = self.statement
+        if isinstance(node, ast.stmt):
+            self.statement = node.lineno
+        super().visit(node)
+        self.statement = before
 
     def place(self, line: int, column: int) -> int:
         """Return the byte of a line and column."""
@@ -69,8 +79,8 @@ class Changes(ast.NodeVisitor):
         if self.inside and old != new:
             name = f"{'.'.join(self.scope)}: {kind}: {_line(around)}: {_line(old)} -> {_line(new)}"
             line = self.source.count(b"\n", 0, begin) + 1
-            change = {"path": self.path, "line": line, "kind": kind, "begin": begin, "end": end, "new": new}
-            self.found.append(Mutant(**change, name=name))
+            place = {"path": self.path, "line": line, "statement": self.statement}
+            self.found.append(Mutant(**place, kind=kind, begin=begin, end=end, new=new, name=name))
 
     def whole(self, node: Any, kind: str, change: Callable[[str], str]) -> None:
         """Note the replacement of a node's whole text."""

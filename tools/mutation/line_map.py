@@ -1,34 +1,43 @@
-"""Which test runs which line: a plugin of pytest (`-p line_map`), and the run of the suite that uses it."""
+"""Which test runs which line: a plugin of pytest (`-p line_map`), and the run of the suite that uses it.
+
+A line counts for each test that uses what the line computed: lines of fixtures that several tests share, and of cached
+functions, count for all of them, and those of forked processes for the test that forked.
+"""
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import json
 import os
 import shutil
-import subprocess
 import sys
 import threading
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
 
+import pytest
+from spread import spread
+
 PACKAGES = {"cgwm_cli": "cli", "schemas": "schemas", "datasets": "datasets", "pipeline": "pipeline"}
 """Folders of the tree by the name that they have inside the package."""
+Lines = set[tuple[str, int]]
 
 
 class LineMap:
     """Plugin of pytest: lines of the product by test, with the seconds of each test that passes, as they end."""
 
     def __init__(self, root: Path, target: Path) -> None:
-        self.root = root
-        self.file = (target / f"map-{os.environ.get('PYTEST_XDIST_WORKER', 'main')}.jsonl").open("w", buffering=1)
+        self.root, self.target, self.pid = root, target, os.getpid()
+        self.file = (target / f"map-{self.pid}.jsonl").open("a", buffering=1)
         self.prefixes = {str((root / folder).resolve()) + os.sep: folder for folder in PACKAGES}
         self.names: dict[str, str | None] = {}
-        self.lines: set[tuple[str, int]] = set()
+        self.lines: Lines = set()
+        self.fixtures: dict[Any, Lines] = defaultdict(set)
         self.tests: dict[str, dict[str, Any]] = {}
+        self.current = ""
         self.monitoring = getattr(sys, "monitoring", None)
         if self.monitoring is not None:
             tool = self.monitoring.COVERAGE_ID
@@ -38,6 +47,9 @@ class LineMap:
         else:
             threading.settrace(self.trace)
             sys.settrace(self.trace)
+        self.end = os._exit
+        os._exit = self.end_of_fork
+        functools.lru_cache, functools.cache = self.replaying(functools.lru_cache), self.replaying(functools.cache)
 
     def own(self, filename: str) -> str | None:
         """Return the path of a product's file relative to the tree; None of all others."""
@@ -48,7 +60,7 @@ class LineMap:
         return self.names[filename]
 
     def saw(self, code: CodeType, line: int) -> Any:
-        """Note a line, once for each test (Python 3.12 and later)."""
+        """Note a line, once until `restart` (Python 3.12 and later)."""
         path = self.own(code.co_filename)
         if path is not None:
             self.lines.add((path, line))
@@ -67,13 +79,72 @@ class LineMap:
         self.lines.add((path, frame.f_lineno))
         return local
 
-    def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """Begin a test."""
-        self.lines = set()
+    def restart(self) -> None:
+        """Note lines again that have been noted."""
         if self.monitoring is not None:
             self.monitoring.restart_events()
         else:
             sys.settrace(self.trace)
+
+    def apart(self, work: Callable[[], Any]) -> tuple[Any, Lines]:
+        """Return what some work returns, and the lines that it runs; they are added to those of the test, too."""
+        before, self.lines = self.lines, set()
+        self.restart()
+        try:
+            found = work()
+        finally:
+            mine, self.lines = self.lines, before | self.lines
+        return found, mine
+
+    def replaying(self, cache: Any) -> Any:
+        """Return a cache of functions which also returns lines: what is in the cache counts for each test that asks."""
+
+        @functools.wraps(cache)
+        def decorate(*options: Any, **named: Any) -> Any:
+            if not (options and callable(options[0])):
+                return lambda function: wrapped(function, cache(*options, **named))
+            return wrapped(options[0], cache)
+
+        def wrapped(function: Any, plain: Any) -> Any:
+            code = getattr(function, "__code__", None)
+            if code is None or not os.path.realpath(code.co_filename).startswith(str(self.root.resolve()) + os.sep):
+                return plain(function)
+            stored = plain(lambda *words, **named: self.apart(lambda: function(*words, **named)))
+
+            @functools.wraps(function)
+            def asked(*words: Any, **named: Any) -> Any:
+                found, lines = stored(*words, **named)
+                self.lines |= lines
+                return found
+
+            asked.cache_clear, asked.cache_info = stored.cache_clear, stored.cache_info  # pyright: ignore
+            return asked
+
+        return decorate
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Generator[None, object, object]:
+        """Keep the lines of a fixture that several tests share."""
+        if fixturedef.scope == "function":
+            return (yield)
+        before, self.lines = self.lines, set()
+        self.restart()
+        try:
+            return (yield)
+        finally:
+            self.fixtures[fixturedef] |= self.lines
+            self.lines |= before
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """Begin a test."""
+        self.lines, self.current = set(), nodeid
+        self.restart()
+
+    def pytest_runtest_call(self, item: Any) -> None:
+        """Add the lines of the fixtures that a test uses."""
+        for name in item.fixturenames:
+            for fixture in item._fixtureinfo.name2fixturedefs.get(name, ()):
+                self.lines |= self.fixtures.get(fixture, set())
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """Add the seconds of a phase."""
@@ -83,19 +154,30 @@ class LineMap:
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
         """Write the lines of a test that passed."""
-        by_file: dict[str, list[int]] = defaultdict(list)
-        for path, line in self.lines.copy():  # threads that a test left behind add to it meanwhile
-            by_file[path].append(line)
         entry = self.tests.pop(nodeid, {"passed": False})
         if entry["passed"]:
-            entry["lines"] = {path: sorted(lines) for path, lines in by_file.items()}
-            self.file.write(json.dumps({nodeid: entry}) + "\n")
+            self.file.write(json.dumps({nodeid: entry | {"lines": by_file(self.lines.copy())}}) + "\n")
+
+    def end_of_fork(self, code: int) -> None:
+        """Write the lines of a process that a test has forked, and end it."""
+        if os.getpid() != self.pid and self.current:
+            text = json.dumps({self.current: {"lines": by_file(self.lines.copy())}})
+            (self.target / f"map-{self.pid}-{os.getpid()}.jsonl").write_text(text + "\n")
+        self.end(code)
+
+
+def by_file(lines: Iterable[tuple[str, int]]) -> dict[str, list[int]]:
+    """Return the numbers of the lines of each file."""
+    found: dict[str, list[int]] = defaultdict(list)
+    for path, line in sorted(lines):
+        found[path].append(line)
+    return found
 
 
 def pytest_configure(config: Any) -> None:
-    """Begin to map where this module is a plugin (`-p line_map`); workers map, their controller does not."""
+    """Begin to map where this module is a plugin (`-p line_map`)."""
     target = os.environ.get("MUTANTS_MAP")
-    if target and (os.environ.get("PYTEST_XDIST_WORKER") or not getattr(config.option, "numprocesses", None)):
+    if target:
         config.pluginmanager.register(LineMap(Path(config.rootpath), Path(target)))
 
 
@@ -120,20 +202,43 @@ def environment_of(tree: Path) -> dict[str, str]:
     }
 
 
-def make_map(root: Path, work: Path, jobs: int, limit_s: float | None, words: Sequence[str]) -> None:
+def merged(target: Path) -> dict[str, Any]:
+    """Return the tests that passed, with the lines of their own processes and of those that they forked."""
+    tests: dict[str, Any] = {}
+    found = [line for path in target.glob("map-*.jsonl") for line in path.read_text().splitlines(keepends=True)]
+    entries = [entry for line in found if line.endswith("\n") for entry in json.loads(line).items()]
+    for name, entry in sorted(entries, key=lambda pair: "passed" not in pair[1]):
+        if "passed" in entry:
+            tests[name] = entry
+        elif name in tests:
+            for path, lines in entry["lines"].items():
+                tests[name]["lines"][path] = sorted({*lines, *tests[name]["lines"].get(path, [])})
+    return tests
+
+
+def longest_first(root: Path, work: Path, chosen: Sequence[str]) -> list[str]:
+    """Return the files of tests; with an earlier map those first that took longest, else those of the most text."""
+    known: dict[str, float] = defaultdict(float)
+    if (work / "map.json").exists():
+        for name, entry in json.loads((work / "map.json").read_text()).items():
+            known[name.partition("::")[0]] += entry["seconds"]
+    files = [path.relative_to(root).as_posix() for path in (root / "tests").rglob("test_*.py")]
+    sizes = {name: (known[name], (root / name).stat().st_size) for name in chosen or files}
+    return sorted(sizes, key=lambda name: sizes[name], reverse=True)
+
+
+def make_map(root: Path, work: Path, jobs: int, limit_s: float | None, chosen: Sequence[str]) -> None:
     """Run the tests once, and keep which of them run which line; a test that has not ended in time counts for none."""
     target = work / "map"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
-    environment = os.environ | environment_of(root) | {"MUTANTS_MAP": str(target)}
-    environment["PYTHONPATH"] += os.pathsep + str(Path(__file__).resolve().parent)
-    spread = ["-n", str(jobs), "--dist", "loadfile", "--no-loadscope-reorder"] if jobs > 1 else []
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "line_map", "-p", "no:cacheprovider", *spread, *words]
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        subprocess.run(command, cwd=root, env=environment, check=False, timeout=limit_s)
-    tests: dict[str, Any] = {}
-    for path in target.glob("map-*.jsonl"):
-        for line in path.read_text().splitlines(keepends=True):
-            tests |= json.loads(line) if line.endswith("\n") else {}
+    environment = environment_of(root) | {"MUTANTS_MAP": str(target)}
+    del environment["PYTHONDONTWRITEBYTECODE"]
+    words = ["-q", "-p", "line_map", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=short", "-rfEs"]
+    parts = [[*words, name] for name in longest_first(root, work, chosen)]
+    left = spread(root, target, parts, environment, jobs, limit_s)
+    tests = merged(target)
     (work / "map.json").write_text(json.dumps(tests))
     print(f"{len(tests)} tests that pass, {sum(t['seconds'] for t in tests.values()):.0f} s of them")
+    for part in left:
+        print(f"not ended in time: {part[-1]}")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import compileall
 import json
 import os
+import py_compile
 import re
 import shutil
-import signal
 import sys
 import time
 from collections import Counter, defaultdict
@@ -17,23 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from changes import Mutant, applied, sample
-from line_map import environment_of
+from line_map import PACKAGES, environment_of
+from spread import fork_pytest, kill_group, preload
 
 TEST_START_S, PATIENCE = 60.0, 8.0
 """A run may take so long [s], and so many times what its tests took when they were mapped."""
-PRELOADED = (
-    "torch",
-    "numpy",
-    "scipy.optimize",
-    "scipy.spatial",
-    "mujoco",
-    "cv2",
-    "h5py",
-    "pydantic",
-    "typer",
-    "pytest",
-)
-"""Imported once, before the processes of the mutants are forked."""
+
+MOST_TESTS = 400
+"""Tests of one run: more than that do not make a survivor likelier to be noticed."""
 
 
 class Slot:
@@ -42,12 +34,13 @@ class Slot:
     def __init__(self, root: Path, folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
         self.folder, self.tree = folder, folder / "tree"
-        skipped = shutil.ignore_patterns(".git", ".venv", "build", "out", "__pycache__", ".links", ".*_cache")
+        skipped = shutil.ignore_patterns(".git", ".venv", "build", "out", ".links", ".*_cache")
         shutil.copytree(root, self.tree, ignore=skipped, symlinks=True)
         (self.tree / ".venv").symlink_to(Path(sys.prefix))
         if (root.parent / "shared").exists():
             (folder / "shared").symlink_to((root.parent / "shared").resolve())
         self.environment = environment_of(self.tree)
+        del self.environment["PYTHONDONTWRITEBYTECODE"]  # bytecode is compared with the hash of the source
         self.pid, self.count, self.began, self.limit = 0, 0, 0.0, 0.0
         self.mutant: Mutant | None = None
         self.before = b""
@@ -64,28 +57,7 @@ class Slot:
         self.words = ["-q", *stop, "-p", "no:cacheprovider", "-p", "no:xdist", f"--rootdir={self.tree}", *tests]
         self.words += [f"--basetemp={self.folder / 'tmp'}", "-rfE", "--tb=no", "-W", "ignore"]
         self.words += ["-c", str(self.tree / "pyproject.toml")]
-        self.pid = os.fork()
-        if self.pid == 0:
-            self.child()
-
-    def child(self) -> None:
-        """Run pytest in the forked process; the test's own processes belong to its group."""
-        code = 70
-        try:
-            os.setsid()
-            os.environ.update(self.environment)
-            os.chdir(self.tree)
-            sys.path[:0] = [str(self.tree / ".links")]
-            sys.dont_write_bytecode = True
-            log = os.open(self.folder / "log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(log, 1)
-            os.dup2(log, 2)
-            import pytest
-
-            code = int(pytest.main(self.words))
-            sys.stdout.flush()
-        finally:
-            os._exit(code)
+        self.pid = fork_pytest(self.tree, self.environment, self.words, self.folder / "log")
 
     def ended(self) -> tuple[int | None, float] | None:
         """Return exit code (None after the time limit) and seconds of a run that is over; None while it goes on."""
@@ -93,10 +65,7 @@ class Slot:
         seconds = time.monotonic() - self.began
         if not pid and seconds < self.limit:
             return None
-        try:
-            os.killpg(self.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
+        kill_group(self.pid)
         if not pid:
             os.waitpid(self.pid, 0)
         if self.mutant is not None:
@@ -115,7 +84,7 @@ def chosen(tests: dict[str, Any], covering: Sequence[str], done: set[str], budge
     found, total = [], 0.0
     for name in sorted((name for name in covering if name not in done), key=lambda name: tests[name]["seconds"]):
         total += tests[name]["seconds"] + 0.05
-        if found and (total > budget or len(found) >= 80):
+        if found and (total > budget or len(found) >= MOST_TESTS):
             break
         found.append(name)
     return found
@@ -132,9 +101,11 @@ def run(root: Path, work: Path, options: argparse.Namespace) -> dict[str, Any]:
     mutants = sample(root, options.count, options.seed, options.folders)
     kept = work / f"results-{options.seed}.json"
     results: dict[str, dict[str, Any]] = json.loads(kept.read_text()) if kept.exists() else {}
+    for folder in PACKAGES:
+        mode = py_compile.PycInvalidationMode.CHECKED_HASH
+        compileall.compile_dir(root / folder, quiet=2, force=True, invalidation_mode=mode)
     slots = [Slot(root, work / "slots" / str(k)) for k in range(options.jobs)]
-    for name in PRELOADED:
-        __import__(name)
+    preload()
     bad: set[str] = set(options.without)
     while True:
         test_all(mutants, results, (tests, by_line, bad), slots, options, kept)
@@ -177,7 +148,8 @@ def test_all(
     waiting = []
     for mutant in mutants:
         entry = results.setdefault(key_of(mutant), asdict(mutant) | {"state": "new", "seconds": 0.0, "ran": []})
-        covering = [name for name in by_line.get((mutant.path, mutant.line), ()) if name not in bad]
+        lines = (by_line.get((mutant.path, line), ()) for line in (mutant.line, mutant.statement))
+        covering = [name for name in next(filter(None, lines), ()) if name not in bad]
         spent = sum(tests[name]["seconds"] for name in entry["ran"] if name in tests)
         names = chosen(tests, covering, set(entry["ran"]), options.budget - spent)
         if not covering:
