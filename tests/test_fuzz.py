@@ -18,6 +18,8 @@ from fuzz.tables import judged, must_accept, must_refuse
 
 QUICK = ("tracks", "model", "cameras.json", "csv", "hdf5", "tum", "jugglebot", "dataset without images")
 SLOW = {"fit", "diagnose", "improve", "view", "synthesize", "compare", "calibrate", "bop", "rosbag"}
+LONG = {"control"}
+"""Words of commands that compute for seconds where nothing is wrong; the tests of control have whole runs of both kinds."""
 HEAVY = ("merged dataset", "filmed", "video file", "things")
 """Subjects that take seconds to make; `test_outputs.py` has the table of what `--overwrite` may replace."""
 VERBS = ("validate", "import", "merge")
@@ -31,9 +33,9 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trial]:
         yield Trial(root / "cases", runner, Library(root / "library"))
 
 
-def every(rows: list[Row], count: int) -> list[Row]:
+def every(rows: list[Row], count: int, slow: set[str] = SLOW) -> list[Row]:
     """Return about `count` lines of a table of each kind, evenly spread, none whose command computes for long."""
-    quick = [row for row in rows if not SLOW & {*row.words} and row.subject not in HEAVY]
+    quick = [row for row in rows if not slow & {*row.words} and row.subject not in HEAVY]
     kinds = list(dict.fromkeys(row.kind for row in quick))
     groups = [[row for row in quick if row.kind == kind] for kind in kinds]
     return [row for group in groups for row in group[:: max(1, len(group) // count)]]
@@ -51,6 +53,6 @@ def test_what_cannot_be_is_refused(trial: Trial, row: Row) -> None:
     assert not judged(trial, row, refuse=True)[1]
 
 
-@pytest.mark.parametrize("row", every(must_accept(), 1), ids=lambda row: row.name)
+@pytest.mark.parametrize("row", every(must_accept(), 1, SLOW | LONG), ids=lambda row: row.name)
 def test_what_is_legitimate_is_accepted(trial: Trial, row: Row) -> None:
     assert not judged(trial, row, refuse=False)[1]

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -10,6 +10,7 @@ import pytest
 from cgwm.datasets import Capture, sha256, synthetic
 from cgwm.datasets.synthetic import fall as fall_scene
 from cgwm.datasets.synthetic import make_scene, plan_scene, read_truth
+from cgwm.datasets.synthetic import record as recording
 from cgwm.datasets.synthetic.dynamics import GRAVITY, STEPS_PER_S, matrix_from_quat, rest_pose, simulate, smooth_path
 from cgwm.datasets.synthetic.objects import FAMILIES, facet_normals, make_object, resting_down, volume_moments
 from cgwm.datasets.synthetic.plan import ScenePlan
@@ -29,8 +30,10 @@ def planned(name: str, seed: int) -> ScenePlan:
 
 
 def made(name: str, directory: Path, seed: int) -> Path:
+    """Write a scene; of its test videos, which no test looks at frame by frame, one frame in 30 is drawn."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "plan_scene", planned)
+        patch.setattr(recording, "build_set", partial(build_set, tests_every=30))
         return make_scene(name, directory, seed=seed, **SMALL)
 
 
