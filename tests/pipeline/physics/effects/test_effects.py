@@ -65,6 +65,8 @@ def rolled(world: World, state: State, duration_s: float, *effects: ActiveEffect
 GROUPS = [[n for n in BUILT_IN if ("driven" in load_effect(n).needs) == driven] for driven in (False, True)]
 """Effects that can be in one world: in the kernel those of the contact are for a body alone on the ground."""
 ROWS = 3
+SPAN_S = 0.013
+"""Time of the derivatives: the corner grazes for its last steps."""
 
 
 @dataclass(frozen=True)
@@ -141,11 +143,11 @@ def test_the_scenes_are_a_flight_a_contact_and_a_graze() -> None:
     there = scenes(0)
     first = State(*(value[there.rows("friction_patch")] for value in vars(there.state).values()))
     world = replace(there.world, effects=(active("friction_patch", c_22=0.5),))
-    record = simulate(world, first, times(0.02, 1000.0), record_contacts=True).contacts
+    record = simulate(world, first, times(SPAN_S, 1000.0), record_contacts=True).contacts
     assert record is not None
     pushes = record.impulse_n_s[..., 2].sum(-1) > 0
     touching = pushes.sum(1).tolist()
-    assert touching[0] == 0 and touching[1] >= 15 and 2 <= touching[2] <= 12
+    assert touching[0] == 0 and touching[1] >= 10 and 2 <= touching[2] <= 8
     assert bool(record.sliding[1].any())
     assert not bool(pushes[2, :5].any())
 
@@ -173,7 +175,7 @@ def derivatives(group: int, at: float) -> Derivatives:
         """Return what is measured."""
         copies = len(x) // count
         state = State(*(value.repeat(copies, *[1] * (value.ndim - 1)) for value in vars(there.state).values()))
-        poses = observed(there.acting(x), state, times(0.02), there.tracks)
+        poses = observed(there.acting(x), state, times(SPAN_S), there.tracks)
         return torch.cat((poses.position_m[:, 1:].flatten(1), poses.quat_wxyz[:, 1:].flatten(1)), -1)
 
     x = torch.zeros(count, size, dtype=F64)
