@@ -19,7 +19,7 @@ from fuzz.tables import judged, must_accept, must_refuse
 QUICK = ("tracks", "model", "cameras.json", "csv", "hdf5", "tum", "jugglebot", "dataset without images")
 SLOW = {"fit", "diagnose", "improve", "view", "synthesize", "compare", "calibrate", "bop", "rosbag"}
 LONG = {"control"}
-"""Words of commands that compute for seconds where nothing is wrong; the tests of control have whole runs of both kinds."""
+"""Words of commands that compute for seconds where nothing is wrong; the tests of control have whole runs."""
 HEAVY = ("merged dataset", "filmed", "video file", "things")
 """Subjects that take seconds to make; `test_outputs.py` has the table of what `--overwrite` may replace."""
 VERBS = ("validate", "import", "merge")

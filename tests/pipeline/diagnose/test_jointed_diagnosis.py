@@ -9,7 +9,7 @@ from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.diagnose.stage import library_of, report
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply, quat_rotate
-from cgwm.pipeline.physics import State, World, simulate
+from cgwm.pipeline.physics import State, World, engine
 from cgwm.pipeline.physics.chain_state import with_joints
 from cgwm.pipeline.segments.center_of_mass import as_one_body
 from cgwm.pipeline.segments.prepare import prepare
@@ -31,7 +31,7 @@ def throws(world: World, noise: tuple[float, float] = (0.0, 0.0)) -> list[Episod
     state = State(place, turn, speed + 0.5 * draws[:, 1:], spins)
     state = with_joints(world, state, {"elbow": 0.4}, {"elbow": 8 * draws[:, 0, 0]})
     times = torch.arange(FRAMES, dtype=F64) / 60
-    motion = simulate(replace(world, touching=False, step_s=0.005), state, times)
+    motion = engine.rollout(replace(world, touching=False, step_s=0.005), state, times)
     shifts, turns = (std * torch.as_tensor(rng.normal(size=(COUNT, FRAMES, 2, 3))) for std in noise)
     position, quat = motion.position_m + shifts, quat_multiply(motion.quat_wxyz, quat_exp(turns))
     return [

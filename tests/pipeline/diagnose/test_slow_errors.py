@@ -283,7 +283,7 @@ def test_an_effect_that_each_group_has_of_its_own_is_named_for_groups(drags: tup
     world, episodes = world_with("ball", ground=False), []
     for group, c in enumerate(drags):
         flying = tosses(
-            world_with("ball", {"linear_drag": {"c": c}}, False), group, count=3, duration_s=0.6, noise=(1e-9, 1e-8)
+            world_with("ball", {"linear_drag": {"c": c}}, False), group, count=3, duration_s=0.45, noise=(1e-9, 1e-8)
         )
         episodes += [(f"{group}{name}", {b: drifting(t, rng) for b, t in tracks.items()}) for name, tracks in flying]
     found = find(prepare(world, episodes, groups=[0, 0, 0, 1, 1, 1]), world, LIBRARY)

@@ -10,7 +10,7 @@ from cgwm.datasets import Track
 from cgwm.pipeline.geometry.rotation import geodesic_angle
 from cgwm.pipeline.optimization.levenberg_marquardt import minimise
 from cgwm.pipeline.phys_geo.tracks.multiple_shooting import Shooting, ShootingFit, ShootingPrior
-from cgwm.pipeline.physics import State, World, simulate
+from cgwm.pipeline.physics import State, World, engine
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
 from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
@@ -47,7 +47,7 @@ def tumble(kicked_at: int | None = None) -> Track:
     world = box_world(law(0.25, 0.004, 0.3))
     state = state_of(((0, 0, 0.07), (1.0, 0.25, 0.1, 0.0), (0.4, 0.1, -0.6), (0.5, -1.0, 0.8)))
     grid = times(DURATION_S, RATE_HZ)
-    rollout = simulate(world, state, grid)
+    rollout = engine.rollout(world, state, grid)
     position, quat = rollout.position_m[0, :, 0], rollout.quat_wxyz[0, :, 0]
     if kicked_at is not None:
         keys = state.__dataclass_fields__
@@ -55,7 +55,7 @@ def tumble(kicked_at: int | None = None) -> Track:
         kick = torch.tensor([[[0.15, -0.2, 0.1]]], dtype=F64)
         turn = torch.tensor([[[3.0, 4.0, -5.0]]], dtype=F64)
         there = replace(there, velocity_m_s=there.velocity_m_s + kick, omega_body_rad_s=there.omega_body_rad_s + turn)
-        after = simulate(world, there, grid[kicked_at:] - grid[kicked_at])
+        after = engine.rollout(world, there, grid[kicked_at:] - grid[kicked_at])
         position = torch.cat([position[:kicked_at], after.position_m[0, :, 0]])
         quat = torch.cat([quat[:kicked_at], after.quat_wxyz[0, :, 0]])
     return noisy(position, quat, grid, NOISE)
@@ -123,7 +123,7 @@ def test_a_body_that_rests_on_many_spheres_starts_at_rest(noise: Noise) -> None:
     # what a straight line through four frames leaves open is 0.23 rad/s for 5 mrad
     assert float(found.state.omega_body_rad_s.norm()) < 60 * noise[1]
     assert float(found.state.velocity_m_s.norm()) < 60 * noise[0]
-    rollout = simulate(world, found.state, times(0.2))
+    rollout = engine.rollout(world, found.state, times(0.2))
     away = (rollout.position_m[0, :, 0] - rest[0]).norm(dim=1)
     assert float(away.max()) < 2 * noise[0]
     assert float(geodesic_angle(rollout.quat_wxyz[0, :, 0], quat[0]).max()) < 2 * noise[1]
@@ -134,7 +134,7 @@ def test_a_body_that_is_struck_while_it_is_watched_keeps_the_velocity_that_it_ha
     world, noise = covered_box(), Noise(2e-4, 2e-3)
     start = state_of(((0, 0, 0.0325), (1.0, 0.02, 0.05, 0.0), (0.5, 0.0, -0.8), (0.0, 0.0, 0.0)))
     grid = torch.arange(7, dtype=F64) / 120
-    rollout = simulate(world, start, grid)
+    rollout = engine.rollout(world, start, grid)
     track = noisy(rollout.position_m[0, :, 0], rollout.quat_wxyz[0, :, 0], grid, noise)
     observations = Observations.of(world, [("0", {"box": track})], [(0.0, 1.0)])
     found, _ = estimate_states(world, observations, torch.ones(1, 7, dtype=torch.bool), noise)

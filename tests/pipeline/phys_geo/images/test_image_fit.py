@@ -13,7 +13,8 @@ from cgwm.pipeline.phys_geo.images import image_fit, video_episodes
 from cgwm.pipeline.phys_geo.images.contact_spheres import MOVED_STD_M, ContactSpheres, dense_times
 from cgwm.pipeline.phys_geo.images.end_to_end import PATIENCE, ImageObjective, refine_end_to_end
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack, PoseTracker
-from cgwm.pipeline.physics.rollout import Rollout, simulate
+from cgwm.pipeline.physics import engine
+from cgwm.pipeline.physics.rollout import Rollout
 from cgwm.pipeline.physics.world import World
 from cgwm.schemas import PhysConfig, UsageError
 from helpers.pose_search import search_briefly
@@ -151,7 +152,7 @@ class Scripted(ImageObjective):
 def test_the_step_is_kept_that_explains_what_was_held_out_best(script: list[float], kept: int) -> None:
     model = tiny_model()
     world = World.from_model(model)
-    rollout = simulate(world, start_state(), torch.arange(FRAMES, dtype=torch.float64) / 30)
+    rollout = engine.rollout(world, start_state(), torch.arange(FRAMES, dtype=torch.float64) / 30)
     plain = objective_of((model, world, rollout), film(model, rollout))
     shared, states = TRUTH + torch.tensor([0.3, -0.4], dtype=torch.float64), torch.zeros(1, 12, dtype=torch.float64)
     states[0, [0, 2, 6, 8]] = torch.tensor([0.01, 0.006, 0.08, 0.08], dtype=torch.float64)
@@ -172,7 +173,7 @@ def resting() -> tuple[World, Rollout]:
     """A box that falls flat by a millimetre, in steps that are short beside the contact."""
     world = world_of(box_body())
     start = state_of(((0, 0, 0.031), (1.0, 0, 0, 0), (0, 0, 0), (0, 0, 0)))
-    return world, simulate(world, start, times(0.1))
+    return world, engine.rollout(world, start, times(0.1))
 
 
 def test_spheres_at_the_ground_are_chosen_and_only_they_change_the_motion() -> None:
@@ -187,10 +188,10 @@ def test_spheres_at_the_ground_are_chosen_and_only_they_change_the_motion() -> N
 
     start = state_of(((0, 0, 0.031), (1.0, 0, 0, 0), (0, 0, 0), (0, 0, 0)))
     zero = spheres.apply(world, torch.zeros(1, 16, dtype=torch.float64))
-    assert torch.equal(simulate(zero, start, times(0.1)).position_m, rollout.position_m)
+    assert torch.equal(engine.rollout(zero, start, times(0.1)).position_m, rollout.position_m)
     lower = torch.zeros(1, 16, dtype=torch.float64)
     lower[0, 2::4] = -1.0  # all centres down by one width of the prior: the box comes to rest so much higher
-    raised = simulate(spheres.apply(world, lower), start, times(0.1)).position_m[0, -1, 0, 2]
+    raised = engine.rollout(spheres.apply(world, lower), start, times(0.1)).position_m[0, -1, 0, 2]
     assert float(raised - rollout.position_m[0, -1, 0, 2]) == pytest.approx(MOVED_STD_M, rel=0.05)
     assert spheres.record(world, lower[0])["box"] == {
         "spheres": 4,

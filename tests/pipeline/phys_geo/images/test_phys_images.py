@@ -21,8 +21,9 @@ from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
 from cgwm.pipeline.phys_geo.images.pose_search import rotation_grid
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTracker
 from cgwm.pipeline.phys_geo.images.video_frames import Footage, Video, load_footage
+from cgwm.pipeline.physics import engine
 from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION, apply_parameters
-from cgwm.pipeline.physics.rollout import Rollout, simulate
+from cgwm.pipeline.physics.rollout import Rollout
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.rendering.render import RenderOutput, render
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
@@ -94,7 +95,7 @@ def scene() -> tuple[Model, World, Rollout]:
     model = tiny_model()
     world = apply_parameters(World.from_model(model), NAMES, TRUTH.exp()[None])
     times = torch.arange(FRAMES, dtype=torch.float64) / RATE
-    rollout = simulate(world, start_state(), times, record_contacts=True)
+    rollout = engine.rollout(world, start_state(), times, record_contacts=True)
     assert rollout.contacts is not None and float(rollout.contacts.impulse_n_s[..., 2].sum()) > 0.1
     return model, world, rollout
 

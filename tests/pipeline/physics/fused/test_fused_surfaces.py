@@ -141,9 +141,9 @@ def test_two_bodies_a_tilted_ground_and_surfaces(fused: Fused) -> None:
     rest = (one.position_m + torch.tensor([0.01, 0.06, 0.0], dtype=F64), one.quat_wxyz, 0.5 * one.velocity_m_s)
     state = State(*(torch.cat(x, 1) for x in zip(one.tensors, (*rest, one.omega_body_rad_s), strict=True)))
     with torch.no_grad():
-        expected = simulate(world, state, times(0.15, 20), record_contacts=True)
+        expected = simulate(world, state, times(0.1, 20), record_contacts=True)
         assert touched(expected.contacts) == {1, -1, -2, -3, -4}
-        agree(expected, fused(world, state, times(0.15, 20), True))
+        agree(expected, fused(world, state, times(0.1, 20), True))
 
 
 @pytest.mark.parametrize(
