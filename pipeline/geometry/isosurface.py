@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .solid_grid import Array, grid_points
-from .surface_distance import union_distance
+from .solid_grid import Array
 
 RESOLUTION = 64
 """Default number of cells along the longest side."""
@@ -29,27 +28,43 @@ def union_mesh(centers: Array, radii: Array, resolution: int = RESOLUTION) -> tu
     pitch = float((high - low).max()) / resolution
     shape = tuple(int(n) for n in np.ceil((high - low) / pitch).astype(int) + 3)
     origin = low - pitch
-    field = union_distance(centers, radii, grid_points(shape, origin, pitch).reshape(-1, 3)).reshape(shape)
-    return _surface_net(field, origin, pitch)
+    return _surface_net(_near_field(centers, radii, shape, origin, pitch), origin, pitch)
+
+
+def _near_field(centers: Array, radii: Array, shape: tuple[int, ...], origin: Array, pitch: float) -> Array:
+    """Return min |p - c| - r over spheres at the points of a grid where it is below 2 pitch, and 2 pitch elsewhere.
+
+    The ends of an edge that crosses the surface are within a pitch of it, so each sphere counts near itself alone.
+    """
+    field = np.full(shape, 2 * pitch)
+    for center, radius in zip(centers, radii, strict=True):
+        reach = radius + 2 * pitch
+        first = np.floor((center - reach - origin) / pitch).astype(int).clip(0)
+        last = np.ceil((center + reach - origin) / pitch).astype(int) + 1
+        near = tuple(map(slice, first, np.minimum(last, shape)))
+        x, y, z = (o + pitch * np.arange(n.start, n.stop) - c for o, n, c in zip(origin, near, center, strict=True))
+        away = np.sqrt((x**2)[:, None, None] + (y**2)[:, None] + z**2) - radius
+        np.minimum(field[near], away, out=field[near])
+    return field
 
 
 def _surface_net(field: Array, origin: Array, pitch: float) -> tuple[Array, NDArray[np.int64]]:
     inside = field < 0
-    cells = tuple(n - 1 for n in field.shape)
-    total, count = np.zeros((*cells, 3)), np.zeros(cells)
+    within = [_at(inside, corner) for corner in _CORNERS]
+    used = np.logical_or.reduce(within) & ~np.logical_and.reduce(within)
+    place, values = np.argwhere(used), [_at(field, corner)[used] for corner in _CORNERS]
+    total, count = np.zeros((len(place), 3)), np.zeros(len(place))
     for a in range(8):
         for b in range(a + 1, 8):
             if (_CORNERS[a] != _CORNERS[b]).sum() != 1:
                 continue  # no edge of the cell
-            first, second = _at(field, _CORNERS[a]), _at(field, _CORNERS[b])
-            crossed = (first < 0) != (second < 0)
-            share = np.where(crossed, first / np.where(crossed, first - second, 1.0), 0.0)
-            total += crossed[..., None] * (_CORNERS[a] + share[..., None] * (_CORNERS[b] - _CORNERS[a]))
+            crossed = (values[a] < 0) != (values[b] < 0)
+            share = np.where(crossed, values[a] / np.where(crossed, values[a] - values[b], 1.0), 0.0)
+            total += crossed[:, None] * (_CORNERS[a] + share[:, None] * (_CORNERS[b] - _CORNERS[a]))
             count += crossed
-    number = np.full(cells, -1, np.int64)
-    used = count > 0
-    number[used] = np.arange(int(used.sum()))
-    vertices = origin + pitch * (np.argwhere(used) + total[used] / count[used][:, None])
+    number = np.full(used.shape, -1, np.int64)
+    number[used] = np.arange(len(place))
+    vertices = origin + pitch * (place + total / count[:, None])
     return vertices, np.concatenate([_quads(inside, number, axis) for axis in range(3)])
 
 

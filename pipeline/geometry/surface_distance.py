@@ -78,9 +78,10 @@ def union_distance(centers: Array, radii: Array, points: Array) -> Array:
 def _deepest(centers: Array, radii: Array, points: Array) -> tuple[Array, Array]:
     """Return min |p - c| - r over spheres at points (n, 3) [m], and the index of that sphere, each (n,)."""
     nearest, which = np.full(points.shape[0], np.inf), np.zeros(points.shape[0], np.int64)
-    for index, (center, radius) in enumerate(zip(centers, radii, strict=True)):
-        away = np.linalg.norm(points - center, axis=1) - radius
-        closer = away < nearest
+    x, y, z = np.ascontiguousarray(points.T, float)
+    for index, ((cx, cy, cz), radius) in enumerate(zip(centers, radii, strict=True)):
+        away = np.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2) - radius
+        closer = np.flatnonzero(away < nearest)
         nearest[closer], which[closer] = away[closer], index
     return nearest, which
 
