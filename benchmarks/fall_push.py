@@ -8,8 +8,9 @@ python benchmarks/fall_push.py --table --by-engine
 The truth is MuJoCo, or what --engines names (`tabletop/engines`); captures of another seed are other motions. The
 engine `cgwm` is our own, against which the rows of cgwm and of the floor alone are measured, for an error budget.
 Every (engine, task, object, material, row) is a stored result, taken up again, so that the table can be finished in
-several runs, on several machines: join the stores' lines. What is there of captures and models in the folder is used;
-the model of an object is fitted once a task, to the photos of the first material's capture.
+several runs, on several machines: join the stores' lines. What is there of captures, models and drafts (the motions
+drawn so far of a capture whose search was cut off) is used. The photos of an object are the same whatever the ground,
+the engine and the motions, so that its model is fitted once with a fingertip and once without.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ from typing import Any, cast
 
 import numpy as np
 from cgwm.pipeline.fit import fit
+from cgwm.pipeline.rendering.contact_sheets import contact_sheet, small_png, tiles
 from cgwm.schemas import CgwmError, NotConvergedError, SplatConfig
-from contenders.base import Cell
+from contenders.base import Cell, Fitted
 from contenders.cgwm_default import FittedCgwm
 from contenders.rows import FLOOR, REFERENCE, ROWS
 from fall_push_engines import engine_table
@@ -39,6 +41,7 @@ from scoring import Judge
 from steps import Step, run_steps
 from store import Store, timed
 from tabletop.capture import TASKS, Task
+from tabletop.draft import NO_DRAFT, Draft
 from tabletop.engines import ENGINES, JUDGES, refusal
 from tabletop.objects import load_item
 from tabletop.plan import TEST_FRAMES
@@ -77,15 +80,22 @@ class Work:
     device: str
     psnr_every: int = 1
     """Frames of test videos that are looked at: every so manyth; 0: none."""
+    drafts: Path | None = None
+    """Where the motions drawn so far of each capture are kept."""
 
     def capture(self, task: str, obj: str, material: str, engine: str = ENGINE) -> Path:
         """Return the directory of a capture, which has no other frames of test videos than are looked at."""
         name = f"{obj}_{material}_{task}" + ("" if self.psnr_every == 1 else f"_{self.psnr_every}")
         return self.folder / ("" if engine == ENGINE else engine) / name
 
+    def draft(self, task: str, obj: str, material: str, engine: str) -> Draft:
+        """Return what keeps the motions of a capture that are drawn so far."""
+        name = f"{task}_{obj}_{material}_{engine}_{self.seed}.json"
+        return NO_DRAFT if self.drafts is None else Draft(self.drafts / name)
+
     def splats(self, task: str, obj: str) -> Path:
         """Return the directory of a model without physics."""
-        return self.folder / "models" / f"{obj}_{task}"
+        return self.folder / "models" / f"{obj}_{_photographed(task)}"
 
     def cell(self, task: str, obj: str, material: str, engine: str = ENGINE) -> Cell:
         """Return what contenders are given; photos, and so splats, are the same whatever the engine."""
@@ -98,21 +108,41 @@ class Work:
             from tabletop import make_capture
 
             path.parent.mkdir(parents=True, exist_ok=True)
-            every = self.psnr_every or TEST_FRAMES
-            make_capture(path, obj, material, cast(Task, task), self.seed, TESTS, engine=engine, tests_every=every)
+            every, draft = self.psnr_every or TEST_FRAMES, self.draft(task, obj, material, engine)
+            make_capture(
+                path, obj, material, cast(Task, task), self.seed, TESTS, engine=engine, tests_every=every, draft=draft
+            )
 
-    def make_splats(self, task: str, obj: str, material: str, engine: str = ENGINE) -> None:
-        """Fit the spheres of an object to the photos of one of its captures."""
-        out = self.splats(task, obj)
+    def make_splats(self, task: str, obj: str) -> None:
+        """Fit the spheres of an object to its photos, from a capture without tests."""
+        out, kind = self.splats(task, obj), _photographed(task)
         if not out.exists():
+            from tabletop import make_capture
+
+            photos = self.folder / "photos" / f"{obj}_{kind}"
+            if not photos.exists():
+                photos.parent.mkdir(parents=True, exist_ok=True)
+                make_capture(photos, obj, "wood", kind, self.seed, tests=0)
             config = SplatConfig(seed=self.seed, device=self.device)  # pyright: ignore[reportArgumentType]
-            fit(self.capture(task, obj, material, engine), out, stage="sg-gs", splat_config=config)
+            fit(photos, out, stage="sg-gs", splat_config=config)
 
 
-def measure(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, Any]:
-    """Fit and judge one row in one cell. A fit that fails is a result, too: `failed` says why."""
+def _photographed(task: str) -> Task:
+    """Return a task with the same photos and bodies: only whether there is a fingertip matters."""
+    return "fall" if task == "fall" else "push"
+
+
+def measure(job: Job, budget_s: float | None, psnr_every: int, pictures: Path | None = None) -> dict[str, Any]:
+    """Fit and judge one row in one cell. A fit that fails is a result, too: `failed` says why.
+
+    Args:
+        job: The row and the cell.
+        budget_s: How long the fit may take, None for as long as it takes.
+        psnr_every: See `Work`.
+        pictures: Folder for the reference's worst prediction of each capture, None for no pictures.
+    """
     figures = _of_job(job) | {"budget_s": budget_s, "psnr_every": psnr_every}
-    return figures | timed(lambda: _measured(job, budget_s, psnr_every))
+    return figures | timed(lambda: _measured(job, budget_s, psnr_every, pictures))
 
 
 def _of_job(job: Job) -> dict[str, Any]:
@@ -120,7 +150,7 @@ def _of_job(job: Job) -> dict[str, Any]:
     return figures | {"seed": job.cell.seed, "device": job.cell.device}
 
 
-def _measured(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, Any]:
+def _measured(job: Job, budget_s: float | None, psnr_every: int, pictures: Path | None) -> dict[str, Any]:
     started = time.perf_counter()
     try:
         fitted = ROWS[job.row].make().fit(job.cell, budget_s)
@@ -136,7 +166,19 @@ def _measured(job: Job, budget_s: float | None, psnr_every: int) -> dict[str, An
         budget = {"true_friction": replace(judge, videos=None).episode_errors(known)}
     if job.engine != ENGINE:  # nobody else has the numbers of MuJoCo's contacts
         errors = {name: value for name, value in errors.items() if name == "friction"}
-    return {"fit": record, "parameter_errors": errors, "episodes": judge.episode_errors(fitted)} | budget
+    episodes = judge.episode_errors(fitted)
+    if pictures is not None and job.row == REFERENCE and judge.videos is not None:
+        _picture(job, judge, fitted, episodes, pictures)
+    return {"fit": record, "parameter_errors": errors, "episodes": episodes} | budget
+
+
+def _picture(job: Job, judge: Judge, fitted: Fitted, episodes: Sequence[dict[str, Any]], folder: Path) -> None:
+    """Write the frames of the episode with the largest error in place: above as filmed, below as predicted."""
+    worst = max(episodes, key=lambda one: one.get("translation_mm", -1.0))
+    strip = judge.strip(fitted, worst["episode"])
+    folder.mkdir(parents=True, exist_ok=True)
+    name = "_".join((job.task, job.object, job.material, job.engine, worst["episode"]))
+    (folder / f"{name}.png").write_bytes(small_png(contact_sheet(tiles(strip, 160)), 80_000))
 
 
 def run(
@@ -148,6 +190,7 @@ def run(
     workers: int = 1,
     seconds: float = float("inf"),
     first: Sequence[str] = (),
+    pictures: Path | None = None,
 ) -> int:
     """Make what is missing of captures, models and results, and return how many steps are left.
 
@@ -162,6 +205,7 @@ def run(
         workers: How many steps run at once.
         seconds: No step begins later.
         first: Objects whose captures come first, see `ordered`.
+        pictures: See `measure`.
     """
     made: dict[tuple[str, ...], Step] = {}
     steps: list[Step] = []
@@ -181,11 +225,12 @@ def run(
         if not jobs:
             continue
         capture = once(cell, partial(_capture_step, work, store, jobs, cell))
-        splats = once(cell[:2], partial(Step, work.make_splats, lambda cell=cell: cell, (capture,)))
-        reference = [_measuring(store, job, (capture, splats), work.psnr_every) for job in jobs if job.row == REFERENCE]
+        photos = (_photographed(task), obj)
+        splats = once(photos, partial(Step, work.make_splats, lambda photos=photos: photos))
+        step = partial(_measuring, store, psnr_every=work.psnr_every, pictures=pictures)
+        reference = [step(job, (capture, splats)) for job in jobs if job.row == REFERENCE]
         steps += reference
-        needs = (capture, splats, *reference)
-        steps += [_measuring(store, job, needs, work.psnr_every) for job in jobs if job.row != REFERENCE]
+        steps += [step(job, (capture, splats, *reference)) for job in jobs if job.row != REFERENCE]
     return run_steps(pool, steps, workers, seconds)
 
 
@@ -237,8 +282,8 @@ def _capture_step(work: Work, store: Store, jobs: Sequence[Job], cell: tuple[str
     return Step(work.make_capture, lambda: cell, spoils=spoils)
 
 
-def _measuring(store: Store, job: Job, needs: Sequence[Step], psnr_every: int) -> Step:
-    return Step(measure, lambda: (job, _budget(store, job), psnr_every), needs, partial(store.add, job.key))
+def _measuring(store: Store, job: Job, needs: Sequence[Step], psnr_every: int, pictures: Path | None) -> Step:
+    return Step(measure, lambda: (job, _budget(store, job), psnr_every, pictures), needs, partial(store.add, job.key))
 
 
 def _budget(store: Store, job: Job) -> float | None:
@@ -272,6 +317,8 @@ def main() -> int:
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
     parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
     parser.add_argument("--psnr-every", type=int, default=1, help="compare every so manyth frame; 0: none")
+    parser.add_argument("--drafts", type=Path, default=None, help="keeps drawn motions, for a search that is cut off")
+    parser.add_argument("--pictures", type=Path, default=None, help="takes pictures of cgwm's worst predictions")
     parser.add_argument("--by-engine", action="store_true", help="with --table: rows against each engine")
     parser.add_argument("--table", action="store_true", help="print the table of what is stored, and measure nothing")
     given = parser.parse_args()
@@ -291,10 +338,10 @@ def main() -> int:
         if unknown:
             parser.error(f"--{key}: {unknown[0]!r} is none of {', '.join(legal)}")
     if not given.table:
-        work = Work(given.folder.resolve(), given.seed, given.device, given.psnr_every)
+        work = Work(given.folder.resolve(), given.seed, given.device, given.psnr_every, given.drafts)
         with ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
             first = [one.strip() for one in given.first.split(",") if one.strip()]
-            left = run(work, store, names, pool, given.captures, given.workers, given.seconds, first)
+            left = run(work, store, names, pool, given.captures, given.workers, given.seconds, first, given.pictures)
         print(f"{left} steps are left.", file=sys.stderr)
     print(engine_table(store.results(), names) if given.by_engine else table(store.results(), names, given.seed))
     return 0

@@ -13,10 +13,14 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import Model, read_model
 from cgwm.datasets.synthetic import TruthFile, read_truth
 from cgwm.pipeline.demo.truth_tables import OBJECT, true_parameters
+from cgwm.pipeline.evaluate.episode_errors import episode_errors
+from cgwm.pipeline.evaluate.frame_strips import strips_of
 from cgwm.pipeline.evaluate.image_errors import VideoErrors
 from cgwm.pipeline.evaluate.prediction import MODEL, EpisodePrediction, Motion
+from cgwm.pipeline.evaluate.stage import EpisodeEvaluation
 from cgwm.pipeline.phys_geo.images.video_exposure import estimate_exposures
 from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.rendering.contact_sheets import FrameStrip
 from cgwm.pipeline.rendering.video_view import usable_cameras
 from cgwm.schemas import InputDataError, NotConvergedError
 from contenders.base import Array, Cell, Fitted, Prediction
@@ -87,6 +91,23 @@ class Judge:
                 {"episode": episode.name, **pose_errors(prediction, episode), **self._images(prediction, episode)}
             )
         return rows
+
+    def strip(self, fitted: Fitted, name: str) -> FrameStrip:
+        """Return the frames looked at of a test episode, from its first camera, with those that are predicted.
+
+        Raises:
+            NotConvergedError: If the prediction fails.
+            ValueError: If no videos are looked at.
+        """
+        if self.videos is None:
+            raise ValueError("no videos are looked at")
+        episode = next(one for one in self.episodes if one.name == name)
+        row = _as_prediction(fitted.predict(episode.start, episode.drives, episode.times_s), episode)
+        camera = usable_cameras(self.videos.capture, name)[0][0]
+        video = replace(self.videos, keep_frames=True).compare(row, camera)
+        videos = () if video is None else (video,)
+        errors = episode_errors(replace(row, noise_floor_m=0.0), videos)  # true poses have no noise
+        return strips_of([EpisodeEvaluation(row, videos, errors)], self.videos.capture)[0]
 
     def parameter_errors(self, parameters: dict[str, float]) -> dict[str, float]:
         """Return relative errors (estimate / truth - 1) of the parameters that the truth has and that are not 0.

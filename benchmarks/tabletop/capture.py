@@ -16,6 +16,7 @@ from cgwm.datasets.synthetic.plan import ScenePlan
 from cgwm.datasets.synthetic.record import build_set, record
 from cgwm.schemas import InputDataError, UsageError, did_you_mean
 
+from .draft import NO_DRAFT, Draft
 from .engines import ENGINES, refusal
 from .materials import MATERIALS
 from .objects import OBJECTS, Item, load_item
@@ -44,6 +45,7 @@ def make_capture(
     overwrite: bool = False,
     engine: str = "mujoco",
     tests_every: int = 1,
+    draft: Draft = NO_DRAFT,
 ) -> Path:
     """Make a capture; the same arguments give the same bytes.
 
@@ -65,6 +67,7 @@ def make_capture(
             that its contacts were made from; only MuJoCo has them as such.
         tests_every: Frames of test videos that are drawn, see `Set`. One of a scanned object takes 0.16 s, and no
             contender sees one.
+        draft: Keeps the motions that are drawn, and has those that were; nothing of a capture depends on it.
 
     Returns:
         `folder` as a path.
@@ -79,7 +82,7 @@ def make_capture(
         if value not in allowed:
             raise UsageError(f"unknown {kind} '{value}'.", ", ".join(allowed) + "." + did_you_mean(value, allowed))
     item = load_item(obj)
-    plan, rejected = plan_capture(item, obj, material, task, seed, tests, engine)
+    plan, rejected = plan_capture(item, obj, material, task, seed, tests, engine, draft)
     print(f"{obj} {material} {task} {engine}: draws left out: {rejected or 'none'}", flush=True)
     with new_directory(Path(folder), "capture", overwrite) as directory:
         stage = build_set(plan, photo_size, video_size, photos, item.paint, item.scan, _SAMPLES, _STILL, tests_every)
@@ -91,7 +94,14 @@ def make_capture(
 
 
 def plan_capture(
-    item: Item, obj: str, material: str, task: Task, seed: int, tests: int, engine: str = "mujoco"
+    item: Item,
+    obj: str,
+    material: str,
+    task: Task,
+    seed: int,
+    tests: int,
+    engine: str = "mujoco",
+    draft: Draft = NO_DRAFT,
 ) -> tuple[ScenePlan, dict[str, int]]:
     """Draw every episode's true motion; nothing is rendered. Also returns the numbers of draws left out, by reason.
 
@@ -110,7 +120,7 @@ def plan_capture(
     rng = np.random.default_rng([scene_seed, 21, zlib.crc32(f"{material}/{task}".encode())])
     contact = MATERIALS[material]
     make = ENGINES[engine].make
-    episodes, rejected = PLANS[task](rng, scene_seed, item.solid, item.down, contact, tests, make)
+    episodes, rejected = PLANS[task](rng, scene_seed, item.solid, item.down, contact, tests, make, draft)
     fingertip = task != "fall"
     plan = ScenePlan(
         name=task,

@@ -32,6 +32,7 @@ from cgwm.schemas import NotConvergedError
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from .draft import NO_DRAFT, Draft
 from .engines import Maker
 from .engines.mujoco_engine import Coulomb
 from .plan import CANDIDATES, FRAME_RATE, RESTING_M_S, TEST_FRAMES, TRAIN_FRAMES, episode_names, speed_at_end
@@ -104,6 +105,7 @@ def plan_strikes(
     contact: ContactTruth,
     tests: int,
     make: Maker = Coulomb,
+    draft: Draft = NO_DRAFT,
 ) -> tuple[tuple[EpisodePlan, ...], dict[str, int]]:
     """Draw one strike to train on and others to test on, each straight, of its own heading, offset and speed.
 
@@ -117,11 +119,23 @@ def plan_strikes(
     engine = make(solid, contact, True)
     rejected: Counter[str] = Counter()
     episodes: list[EpisodePlan] = []
+    begun = draft.read(rng, rejected)
     for index, name in enumerate(episode_names(tests)):
         split, frames = ("train", TRAIN_FRAMES) if index == 0 else ("test", TEST_FRAMES)
         duration = frames / FRAME_RATE
         times = np.arange(round((_SETTLING_S + duration) * STEPS_PER_S) + 1) / STEPS_PER_S - _SETTLING_S
-        best: tuple[float, Motion] | None = None
+
+        def struck(
+            qpos: Array, points: Array, speed: float, duration: float = duration, times: Array = times
+        ) -> Motion:
+            path = smooth_path(points, speed, _RAMP_S, times)
+            return engine.simulate(qpos, np.zeros(6), -_SETTLING_S, duration, path)
+
+        if index < len(begun):
+            motion = struck(begun[index][:7], begun[index][7:13].reshape(2, 3), float(begun[index][13]))
+            episodes.append(EpisodePlan(name, split, frames, motion))
+            continue
+        best: tuple[float, Motion, Array] | None = None
         candidates = 0
         for _ in range(_TRIES):
             qpos, points, speed = _push(strike, rng, model, solid, down, split)
@@ -129,9 +143,7 @@ def plan_strikes(
             if stops > _STOPS_S:
                 rejected["stops late"] += 1
                 continue
-            motion = engine.simulate(
-                qpos, np.zeros(6), -_SETTLING_S, duration, smooth_path(points, speed, _RAMP_S, times)
-            )
+            motion = struck(qpos, points, speed)
             fault = strike.fault(motion, stops if split == "train" else None)
             if fault is None and not stays_in_view(solid, motion, cameras):
                 fault = "out of view"
@@ -139,7 +151,7 @@ def plan_strikes(
                 candidates += 1
                 unrest = speed_at_end(solid, motion)
                 if best is None or unrest < best[0]:
-                    best = unrest, motion
+                    best = unrest, motion, np.concatenate((qpos, points.ravel(), [speed]))
                 if unrest < RESTING_M_S or candidates == CANDIDATES:
                     break
                 fault = "no rest"
@@ -148,6 +160,8 @@ def plan_strikes(
             reasons = ", ".join(f"{reason} {count}" for reason, count in rejected.items())
             raise NotConvergedError(f"none of {_TRIES} pushes of the {solid.family} serves ({reasons}).")
         episodes.append(EpisodePlan(name, split, frames, best[1]))
+        begun.append(best[2])
+        draft.write(rng, rejected, begun)
     return tuple(episodes), dict(rejected)
 
 

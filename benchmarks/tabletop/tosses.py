@@ -22,6 +22,7 @@ from cgwm.datasets.synthetic.rig import video_cameras
 from cgwm.schemas import NotConvergedError
 from numpy.typing import NDArray
 
+from .draft import NO_DRAFT, Draft
 from .engines import Maker
 from .engines.mujoco_engine import Coulomb
 from .plan import CANDIDATES, FRAME_RATE, RESTING_M_S, TEST_FRAMES, TRAIN_FRAMES, episode_names, speed_at_end
@@ -44,6 +45,7 @@ def plan_tosses(
     contact: ContactTruth,
     tests: int,
     make: Maker = Coulomb,
+    draft: Draft = NO_DRAFT,
 ) -> tuple[tuple[EpisodePlan, ...], dict[str, int]]:
     """Draw one toss to train on and others to test on; every second test is thrown spinning, the others flat.
 
@@ -55,6 +57,7 @@ def plan_tosses(
         contact: The true contact.
         tests: Number of test episodes.
         make: Makes the engine whose motions are the truth.
+        draft: Keeps the episodes that are drawn, and has those that were.
 
     Returns:
         The episodes, and how many draws were left out for which reason.
@@ -65,10 +68,15 @@ def plan_tosses(
     engine, cameras = make(solid, contact, False), video_cameras(camera_seed).values()
     rejected = {"like another": 0, "contact time": 0, "no slip": 0, "out of view": 0, "chaotic": 0, "no rest": 0}
     episodes: list[EpisodePlan] = []
+    begun = draft.read(rng, rejected)
     for index, name in enumerate(episode_names(tests)):
         split, frames = ("train", TRAIN_FRAMES) if index == 0 else ("test", TEST_FRAMES)
         duration = frames / FRAME_RATE
-        best: tuple[float, Motion] | None = None
+        if index < len(begun):
+            motion = engine.simulate(begun[index][:7], begun[index][7:], -EXPOSURE_LEAD_S, duration)
+            episodes.append(EpisodePlan(name, split, frames, motion))
+            continue
+        best: tuple[float, Motion, Array] | None = None
         candidates = 0
 
         def again(other: ContactTruth, qpos: Array, qvel: Array, duration: float = duration) -> Motion:
@@ -93,13 +101,15 @@ def plan_tosses(
                 candidates += 1
                 unrest = 0.0 if split == "train" else speed_at_end(solid, motion)
                 if best is None or unrest < best[0]:
-                    best = unrest, motion
+                    best = unrest, motion, np.concatenate((qpos, qvel))
                 if unrest < RESTING_M_S or candidates == CANDIDATES:
                     break
                 rejected["no rest"] += 1
         if best is None:
             raise NotConvergedError(f"fall: none of {_TRIES} tosses of the {solid.family} serves as episode {name}.")
         episodes.append(EpisodePlan(name, split, frames, best[1]))
+        begun.append(best[2])
+        draft.write(rng, rejected, begun)
     return tuple(episodes), rejected
 
 

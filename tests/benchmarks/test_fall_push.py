@@ -179,6 +179,16 @@ def test_results_are_stored_and_taken_up_again(bench, work, tmp_path, monkeypatc
     assert lines["ballistic"][2] == f"{np.median(means):.1f} ({np.mean(means):.1f})"
 
 
+def test_the_worst_prediction_becomes_a_picture(bench, work, judge, tmp_path):
+    cell = work.cell("fall", "box", "wood")
+    job = bench.fall_push.Job("fall", "box", "wood", "cgwm", cell)
+    fitted = bench.zeros.Frozen().fit(cell, None)
+    bench.fall_push._picture(job, judge, fitted, judge.episode_errors(fitted), tmp_path / "pictures")
+    strip = judge.strip(fitted, TESTS[1])
+    assert strip.masks is not None and strip.real.shape == strip.predicted.shape
+    assert [path.stem[:-4] for path in (tmp_path / "pictures").iterdir()] == ["fall_box_wood_mujoco"]
+
+
 def test_a_budget_needs_its_reference(bench, work, tmp_path, monkeypatch):
     monkeypatch.setattr(bench.fall_push, "ROWS", {"rival": bench.rows.Row(bench.zeros.Frozen, 1.0)})
     with ThreadPoolExecutor(1) as pool, pytest.raises(SystemExit, match="budget"):
