@@ -22,7 +22,7 @@ help:
 	@echo 'make docs      build the documentation as a site that is read offline: build/docs/index.html'
 	@echo 'make dist      the source archive, and the wheel that is built from it: dist/'
 	@echo 'make evidence  the measurements that take longer than tests may; resumable, results in out/evidence/'
-	@echo 'make results   write docs/results*.md from the figures in benchmarks/results/'
+	@echo 'make results   write docs/results*.md and docs/engine-table.md from the stored figures'
 	@echo 'make clean     remove what make made: $(VENV)/, build/, out/'
 
 install: $(VENV)/linked
@@ -72,6 +72,7 @@ evidence: install
 
 results:
 	$(PYTHON) benchmarks/render_results.py
+	$(PYTHON) benchmarks/engine_page.py
 
 clean:
 	rm -rf $(VENV) build out dist *.egg-info .pytest_cache .ruff_cache

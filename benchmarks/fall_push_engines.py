@@ -52,7 +52,7 @@ def engine_table(results: Sequence[dict[str, Any]], names: dict[str, Sequence[st
 
 
 def _line(name: str, rows: Sequence[dict[str, Any]]) -> str:
-    mine, reference = _captures(rows, name), _captures(rows, REFERENCE)
+    mine, reference = captures_of(rows, name), captures_of(rows, REFERENCE)
     chosen = [row for row in rows if row["row"] == name]
     failed = sum("failed" in row for row in chosen)
     cells = [f"{len(mine)}" + (f" ({failed} failed)" if failed else "")]
@@ -62,14 +62,14 @@ def _line(name: str, rows: Sequence[dict[str, Any]]) -> str:
     known = [row for row in chosen if "friction" in row.get("parameter_errors", ())]
     friction = [abs(row["parameter_errors"]["friction"]) for row in known]
     cells.append(f"{100 * np.median(friction):.0f}" if friction else "–")
-    hold = [held for row in chosen if "failed" not in row for held in _held(row)]
+    hold = [one for row in chosen if "failed" not in row for one in held(row)]
     cells.append(f"{sum(hold)} of {len(hold)}" if hold else "–")
     for key in ("translation_mm", "rotation_deg"):
         cells.append("" if name == REFERENCE else _difference(mine, reference, key))
     return f"| {name} | " + " | ".join(cells) + " |"
 
 
-def _captures(rows: Sequence[dict[str, Any]], name: str) -> Errors:
+def captures_of(rows: Sequence[dict[str, Any]], name: str) -> Errors:
     """Return the medians of a row's captures; episodes that diverged count as infinitely wrong."""
     result: Errors = {}
     for row in rows:
@@ -84,7 +84,7 @@ def _captures(rows: Sequence[dict[str, Any]], name: str) -> Errors:
     return result
 
 
-def _held(row: dict[str, Any]) -> list[bool]:
+def held(row: dict[str, Any]) -> list[bool]:
     """Return which of a fit's intervals of friction hold the truth: the number that every engine knows."""
     interval = row["fit"].get("intervals_95", {}).get("friction")
     error = row["parameter_errors"].get("friction")

@@ -1,0 +1,215 @@
+"""The engine table as a page: takes rows of `fall_push.py`, reduced, and writes docs/engine-table.md from them.
+
+    python benchmarks/engine_page.py take out/evidence/fall_push.jsonl   # adds or replaces rows
+    python benchmarks/engine_page.py                                     # writes the page
+
+Rows keep the errors of every episode, the friction with its interval, seconds and commit, so that
+`fall_push.py --table --by-engine --any-commit --store benchmarks/engine_rows.jsonl` prints its tables from them, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from contenders.rows import FLOOR, REFERENCE
+from fall_push_engines import POOLED_WITHOUT, Errors, bootstrap_interval, captures_of, held
+from numpy.typing import NDArray
+from store import ROOT
+
+STORED = ROOT / "benchmarks" / "engine_rows.jsonl"
+PAGE = ROOT / "docs" / "engine-table.md"
+ROWS = {
+    REFERENCE: "cgwm",
+    FLOOR: "floor",
+    "frozen": "nothing moves",
+    "CEM + MuJoCo + R, true mesh, 1x": "CEM, true mesh",
+    "CEM + MuJoCo + R, learned shape, 1x": "CEM, learned shape",
+    "cgwm, geometry refined": "geometry refined",
+    "PIN-WM": "PIN-WM",
+}
+"""Rows of the page, in its order, and their names there."""
+TASKS = ("fall", "push", "tip")
+ENGINES = ("rapier", "dart", "mujoco")
+WANTED = 8
+"""Captures of every engine and task."""
+_MM, _DEG, _DB = "translation_mm", "rotation_deg", "psnr_object_db"
+_DECIMALS = {_MM: 1, _DEG: 1, _DB: 2}
+_INTRODUCTION = (
+    "# The engine table\n\n"
+    "Written by `benchmarks/engine_page.py` from the stored rows `benchmarks/engine_rows.jsonl`. What the rows are, "
+    "and what follows from them: [Other engines as the truth](engine-floor.md).\n\n"
+    "mm / deg: medians over the ten test motions of a capture, then over captures, whose number stands in brackets. "
+    "Differences to cgwm are paired by capture: median, and 95 % interval of a bootstrap over captures; for mm and deg "
+    "the row is worse above 0, for dB below."
+)
+_POOLED = (
+    "row", "captures", "mm / deg", "object PSNR dB", "friction error %", "intervals that hold", "seconds",
+    "to cgwm: mm", "deg", "dB",
+)  # fmt: skip
+_BARS = ("task", "captures", "cgwm / floor, mm", "cgwm / floor, deg", "PSNR to the floor's, dB")
+
+
+def reduced(row: dict[str, Any]) -> dict[str, Any]:
+    """Return what the page needs of a stored result."""
+    kept = {key: row[key] for key in ("key", "commit", "task", "object", "material", "row", "seed", "device")}
+    kept["engine"] = row.get("engine", "mujoco")
+    if "not_run" in row or "failed" in row:
+        return kept | {key: row[key] for key in ("not_run", "failed") if key in row}
+    fit = row["fit"]
+    numbers = {name: value for name, value in fit.get("parameters", {}).items() if name == "friction"}
+    intervals = {name: value for name, value in fit.get("intervals_95", {}).items() if name == "friction"}
+    kept["fit"] = {"seconds": fit.get("seconds"), "parameters": numbers, "intervals_95": intervals}
+    kept["parameter_errors"] = {k: v for k, v in row["parameter_errors"].items() if k == "friction"}
+    kept["episodes"] = [
+        {key: round(episode[key], digits + 1) for key, digits in _DECIMALS.items() if key in episode}
+        for episode in row["episodes"]
+    ]
+    return kept
+
+
+def take(paths: Sequence[Path], stored: Path = STORED) -> int:
+    """Add the rows of stores to the stored ones, a later one in place of an earlier one; return how many are there."""
+    rows = {row["key"]: row for row in read(stored)} if stored.exists() else {}
+    for path in paths:
+        rows |= {row["key"]: reduced(row) for row in read(path) if row["row"] in ROWS}
+    stored.write_text("".join(json.dumps(rows[key]) + "\n" for key in sorted(rows)), encoding="utf-8")
+    return len(rows)
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a file of JSON lines."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def page(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the page in Markdown."""
+    others = [row for row in rows if row["engine"] not in POOLED_WITHOUT]
+    parts = [_INTRODUCTION, "## All engines but MuJoCo"]
+    for task in TASKS:
+        parts.append(f"**{task.capitalize()}**\n\n{_pooled([row for row in others if row['task'] == task])}")
+    parts.append(f"**All three tasks**\n\n{_pooled(others)}")
+    parts.append(f"**Against the floor**, on the captures that have both\n\n{_bars(others)}")
+    parts += ["## By engine", _by_engine(rows), "## Captures", _counts(rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _head(names: Sequence[str]) -> list[str]:
+    return ["| " + " | ".join(names) + " |", "| --- " * len(names) + "|"]
+
+
+def _bars(rows: Sequence[dict[str, Any]]) -> str:
+    """Return how cgwm's medians compare with the floor's, on the captures that both have."""
+    lines = _head(_BARS)
+    for task in (*TASKS, "all three"):
+        here = [row for row in rows if task in (row["task"], "all three")]
+        mine, floor = captures_of(here, REFERENCE), captures_of(here, FLOOR)
+        both = [capture for capture in mine if capture in floor]
+        if both:
+            ratios = [
+                np.median([mine[c][key] for c in both]) / np.median([floor[c][key] for c in both])
+                for key in (_MM, _DEG)
+            ]
+            gap = float(np.median(-paired(floor, mine, _DB)))
+            lines.append(f"| {task} | {len(both)} | {ratios[0]:.2f} | {ratios[1]:.2f} | {gap:+.2f} |")
+    return "\n".join(lines)
+
+
+def _pooled(rows: Sequence[dict[str, Any]]) -> str:
+    lines = _head(_POOLED)
+    reference = captures_of(rows, REFERENCE)
+    for name, shown in ROWS.items():
+        mine, chosen = captures_of(rows, name), [row for row in rows if row["row"] == name and "fit" in row]
+        if not mine:
+            continue
+        errors = [abs(row["parameter_errors"]["friction"]) for row in chosen if "friction" in row["parameter_errors"]]
+        kept = [one for row in chosen for one in held(row)]
+        seconds = [row["fit"]["seconds"] for row in chosen if row["fit"]["seconds"]]
+        known = bool(errors) and name != FLOOR
+        cells = [
+            shown,
+            str(len(mine)),
+            _middle(mine),
+            _median(mine, _DB),
+            f"{100 * np.median(errors):.0f}" if known else "–",
+        ]
+        cells += [f"{sum(kept)} of {len(kept)}" if kept else "–", f"{np.median(seconds):.0f}" if seconds else "–"]
+        cells += [difference(mine, reference, key) if name != REFERENCE else "" for key in (_MM, _DEG, _DB)]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def difference(mine: Errors, reference: Errors, key: str) -> str:
+    """Return the median paired difference of two rows with its interval; both have to have the capture."""
+    gaps = paired(mine, reference, key)
+    if len(gaps) < 2:
+        return "–"
+    low, high = bootstrap_interval(gaps)
+    digits = _DECIMALS[key]
+    return f"{np.median(gaps):+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
+
+
+def paired(mine: Errors, reference: Errors, key: str) -> NDArray[np.float64]:
+    """Return the differences of two rows on the captures that both have, without those that are not finite."""
+    both = [c for c in mine if c in reference and key in mine[c] and key in reference[c]]
+    gaps = np.array([mine[capture][key] - reference[capture][key] for capture in both])
+    return gaps[np.isfinite(gaps)]
+
+
+def _by_engine(rows: Sequence[dict[str, Any]]) -> str:
+    there = [name for name in ROWS if captures_of(rows, name)]
+    lines = _head(("task", "engine", *(ROWS[name] for name in there)))
+    for task in TASKS:
+        for engine in ENGINES:
+            here = [row for row in rows if (row["task"], row["engine"]) == (task, engine)]
+            found = [captures_of(here, name) for name in there]
+            cells = [f"{_middle(one)} ({len(one)})" if one else "–" for one in found]
+            lines.append(f"| {task} | {engine} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _counts(rows: Sequence[dict[str, Any]]) -> str:
+    """Return a table of which captures have cgwm's row, by task and engine."""
+    lines = _head(("task", "engine", f"captures of {WANTED}", "object and ground"))
+    for task in TASKS:
+        for engine in ENGINES:
+            here = [row for row in rows if (row["task"], row["engine"]) == (task, engine)]
+            found = sorted(captures_of(here, REFERENCE))
+            names = [
+                " ".join((obj, ground) if seed == "500" else (obj, ground, f"(seed {seed})"))
+                for _, _, obj, ground, seed in found
+            ]
+            lines.append(f"| {task} | {engine} | {len(found)} | {', '.join(names).replace('_', ' ')} |")
+    commits = ", ".join(f"`{one[:7]}`" for one in sorted({row["commit"] for row in rows}))
+    return "\n".join(lines) + f"\n\nRows of commits {commits}."
+
+
+def _median(errors: Errors, key: str) -> str:
+    values = [one[key] for one in errors.values() if key in one]
+    return f"{np.median(values):.{_DECIMALS[key]}f}" if values else "–"
+
+
+def _middle(errors: Errors) -> str:
+    return f"{_median(errors, _MM)} / {_median(errors, _DEG)}"
+
+
+def main() -> int:
+    """Take rows, or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="*", help="take STORE...; left out, the page is written")
+    given = parser.parse_args().what
+    if given[:1] == ["take"]:
+        print(f"{take([Path(one) for one in given[1:]])} rows in {STORED.relative_to(ROOT)}")
+    elif given:
+        parser.error(f"{given[0]!r} is not 'take'")
+    PAGE.write_text(page(read(STORED)), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,62 @@
+"""The page of the engine table, and the draft of a capture's motions."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))  # as `python benchmarks/engine_page.py` has it
+try:
+    import engine_page
+    from tabletop.draft import Draft
+finally:
+    sys.path.remove(str(BENCHMARKS))
+
+ROW = {"task": "fall", "object": "box", "material": "wood", "engine": "rapier", "seed": 500, "device": "cuda"}
+
+
+def row(name: str, seed: int, errors_mm: list[float], commit: str = "abc") -> dict:
+    """A stored result with these errors."""
+    episodes = [
+        {"translation_mm": one, "rotation_deg": 2.0, "psnr_object_db": 17.123, "psnr_db": 20} for one in errors_mm
+    ]
+    fit = {"seconds": 3.0, "parameters": {"friction": 0.44, "x": 1}, "intervals_95": {"friction": [0.3, 0.5]}}
+    more = {"row": name, "commit": commit, "key": f"{name}/{seed}", "fit": fit, "episodes": episodes, "seed": seed}
+    return ROW | more | {"parameter_errors": {"friction": 0.1}, "wall_s": 4}
+
+
+def test_the_page_is_that_of_the_stored_rows() -> None:
+    stored = engine_page.page(engine_page.read(engine_page.STORED))
+    assert engine_page.PAGE.read_text(encoding="utf-8") == stored
+
+
+def test_rows_are_reduced_and_replaced(tmp_path: Path) -> None:
+    store, rows = tmp_path / "store.jsonl", tmp_path / "rows.jsonl"
+    for errors in ([50.0], [10.0, 30.0]):
+        store.write_text(engine_page.json.dumps(row("cgwm", 500, errors)) + "\n", encoding="utf-8")
+        assert engine_page.take([store], rows) == 1
+    (kept,) = engine_page.read(rows)
+    assert [one["translation_mm"] for one in kept["episodes"]] == [10.0, 30.0]
+    assert "wall_s" not in kept and kept["fit"]["parameters"] == {"friction": 0.44}
+
+
+def test_the_page_pairs_captures() -> None:
+    rows = [row("cgwm", k, [10.0 + k]) for k in (500, 501, 502)] + [row("floor", k, [8.0 + k]) for k in (500, 501)]
+    text = engine_page.page([engine_page.reduced(one) for one in rows])
+    assert "| cgwm | 3 | 511.0 / 2.0 | 17.12 | 10 | 3 of 3 | 3 |" in text
+    assert "-2.0 (-2.0 to -2.0)" in text and "| fall | 2 | 1.00 | 1.00 | +0.00 |" in text
+    assert "| fall | rapier | 3 | box wood, box wood (seed 501), box wood (seed 502) |" in text
+
+
+def test_a_draft_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    draft, rng, rejected = Draft(tmp_path / "drafts" / "one.json"), np.random.default_rng(3), {"chaotic": 2}
+    beginnings = [rng.standard_normal(13)]
+    draft.write(rng, rejected, beginnings)
+    other, empty = np.random.default_rng(9), {"chaotic": 0}
+    (known,) = draft.read(other, empty)
+    assert np.array_equal(known, beginnings[0]) and empty == rejected
+    assert np.array_equal(other.standard_normal(5), rng.standard_normal(5))
+    assert Draft().read(other, empty) == []
