@@ -209,8 +209,14 @@ def _models(database: Path, inputs: Inputs, seed: int) -> tuple[list[Mapped], st
 
 
 def _supported(mapped: Mapped, start: str, inputs: Inputs, seed: int) -> tuple[Mapped, str]:
-    """Return a model without outliers, with cameras as rich as its observations support, and how rich they are."""
+    """Return a model without outliers, with cameras as rich as its observations support, and how rich they are.
+
+    Principal points are moved first: what a wrong one moves at the borders of photos would be taken for outliers, and
+    what is left would confirm it.
+    """
     tried = richer(start, "SIMPLE_PINHOLE" if _all_known(inputs) else "OPENCV")
+    mapped = adjusted(mapped, limited(start, inputs), inputs.known, seed)
+    mapped = _with_principal_points(mapped, start, inputs, seed)
     with ThreadPoolExecutor(min(processors(), len(tried))) as pool:  # COLMAP adjusts each in one thread
         found = pool.map(lambda model: adjusted(mapped, limited(model, inputs), inputs.known, seed), tried)
         steps = dict(zip(tried, found, strict=True))
