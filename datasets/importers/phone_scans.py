@@ -2,8 +2,8 @@
 
 Both store what ARKit measured: poses camera to world [m], OpenGL camera axes (x right, y up, z backward), in a world
 whose y axis points up, which is turned to z up here. Sources: Polycam, "How to extract raw data and what is included"
-and github.com/PolyCam/polyform; Record3D, record3d.app and the readers of nerfstudio (`process_data`). No recording
-of either was at hand: tests write files by these descriptions.
+and github.com/PolyCam/polyform; Record3D, record3d.app and the readers of nerfstudio (`process_data`). Tests
+write files by these descriptions; Record3D was tried on one published recording, Polycam on none.
 """
 
 from __future__ import annotations
