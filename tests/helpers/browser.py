@@ -30,9 +30,11 @@ class Page:
 
         self._socket = connect(address, max_size=None)
         self._number, self._session = 0, None
+        self.errors: list[str] = []  # what the page wrote into its console as an error, or left uncaught
         target = self._call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        self._call("Page.enable")
+        for domain in ("Page", "Runtime", "Log"):
+            self._call(f"{domain}.enable")
 
     def open(self, url: str) -> None:
         self._call("Page.navigate", url=url)
@@ -79,6 +81,20 @@ class Page:
             if answer.get("id") == self._number:
                 assert "error" not in answer, answer
                 return answer["result"]
+            self.errors += error_of(answer)
+
+
+def error_of(event: dict[str, Any]) -> list[str]:
+    """Return what an event of DevTools says, if it is an error."""
+    said = event.get("params", {})
+    kind = event.get("method")
+    if kind == "Runtime.exceptionThrown":
+        return [json.dumps(said["exceptionDetails"])]
+    if kind == "Runtime.consoleAPICalled" and said["type"] in ("error", "assert"):
+        return [json.dumps(said["args"])]
+    if kind == "Log.entryAdded" and said["entry"]["level"] == "error":
+        return [json.dumps(said["entry"])]
+    return []
 
 
 @contextmanager

@@ -385,6 +385,7 @@ def test_the_slider_moves_the_splats(red_dataset: Path, tmp_path: Path, served: 
         eventually(page, lambda found: len(found) == 0)
         click(page, "Play")
         page.until("document.body.innerText.includes('Pause') && !document.body.innerText.includes('frame 7 of 16')")
+        assert page.errors == []
 
 
 @needs_viser
@@ -406,3 +407,4 @@ def test_a_model_opens_in_motion(red_dataset: Path, tmp_path: Path, served: Call
         page.run("[...document.querySelectorAll('[role=option]')].find(e => e.innerText === 'rollout 0').click()")
         page.until_it_says("frame 1 of 31")
         eventually(page, lambda found: len(found) > 100 and bool(np.linalg.norm(found.mean(0) - resting) > 20))
+        assert page.errors == []
