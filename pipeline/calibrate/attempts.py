@@ -214,11 +214,11 @@ def _supported(mapped: Mapped, start: str, inputs: Inputs, seed: int) -> tuple[M
     Principal points are moved first: what a wrong one moves at the borders of photos would be taken for outliers, and
     what is left would confirm it.
     """
-    first = _with_principal_points(adjusted(mapped, limited(start, inputs), inputs.known, seed), start, inputs, seed)
-    tried = () if _all_known(inputs) else richer(start, "OPENCV")[1:]
-    with ThreadPoolExecutor(min(processors(), max(len(tried), 1))) as pool:  # COLMAP adjusts each in one thread
-        found = pool.map(lambda model: adjusted(first, limited(model, inputs), inputs.known, seed), tried)
-        steps = {start: first} | dict(zip(tried, found, strict=True))
+    tried = richer(start, "SIMPLE_PINHOLE" if _all_known(inputs) else "OPENCV")
+    mapped = _with_principal_points(mapped, start, inputs, seed)
+    with ThreadPoolExecutor(min(processors(), len(tried))) as pool:  # COLMAP adjusts each in one thread
+        found = pool.map(lambda model: adjusted(mapped, limited(model, inputs), inputs.known, seed), tried)
+        steps = dict(zip(tried, found, strict=True))
     free = len(set(mapped.names.values()) - set(inputs.known))
     taken = supported([(model, step.residuals_px()) for model, step in steps.items()], free)
     return without_outliers(steps[taken], inputs.known, seed), taken
