@@ -350,6 +350,14 @@ def is_cube(found: np.ndarray, middle: np.ndarray, area: float) -> bool:
     return 0.5 * area < len(found) < 3 * area and bool(np.linalg.norm(found.mean(0) - middle) < 0.2 * np.sqrt(area))
 
 
+def faults(page: Page) -> list[str]:
+    """Return the errors in the console, but for one of viser 1.1: the corners of its splats have no third coordinate.
+
+    three.js then finds no bounding sphere, so that splats are never culled; all else is drawn as it should be.
+    """
+    return [error for error in page.errors if "computeBoundingSphere" not in error]
+
+
 def click(page: Page, label: str) -> None:
     """Click a checkbox or a button by its label."""
     found = page.run(
@@ -385,7 +393,7 @@ def test_the_slider_moves_the_splats(red_dataset: Path, tmp_path: Path, served: 
         eventually(page, lambda found: len(found) == 0)
         click(page, "Play")
         page.until("document.body.innerText.includes('Pause') && !document.body.innerText.includes('frame 7 of 16')")
-        assert page.errors == []
+        assert faults(page) == []
 
 
 @needs_viser
@@ -407,4 +415,4 @@ def test_a_model_opens_in_motion(red_dataset: Path, tmp_path: Path, served: Call
         page.run("[...document.querySelectorAll('[role=option]')].find(e => e.innerText === 'rollout 0').click()")
         page.until_it_says("frame 1 of 31")
         eventually(page, lambda found: len(found) > 100 and bool(np.linalg.norm(found.mean(0) - resting) > 20))
-        assert page.errors == []
+        assert faults(page) == []
