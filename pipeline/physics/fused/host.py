@@ -1,7 +1,8 @@
 """Fused kernel on the CPU: the CUDA source, built once by a C++ compiler and cached, one thread per core.
 
 Its results equal those of the torch engine up to rounding, in a tenth of the time: a step of the torch engine takes a
-hundred operations on small tensors, each of which is dominated by its overhead.
+hundred operations on small tensors, each of which is dominated by its overhead. Rollouts of one body above the ground
+are simulated several at once, in the places of a vector, which changes no bit.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -21,7 +23,7 @@ from ..rollout import Rollout
 from ..world import State, World
 from .packing import reason_against
 from .rollout import roll
-from .structure import Structure, kernel_file
+from .structure import MOTION_COLUMNS, Structure, kernel_file
 
 if TYPE_CHECKING:
     from ....datasets.capture.tracks import Track
@@ -37,7 +39,13 @@ SUBSTEPS = 10
 SHARES = 4
 """Number of times that a thread comes for rollouts, so that all end at about the same time."""
 MOST_AT_ONCE = 8
-"""Maximum number of rollouts that a thread takes at once."""
+"""Maximum number of rollouts that a thread takes at once; rounded up to whole vectors."""
+LEAST_WIDE = 16
+"""Number of rollouts from which they are simulated in vectors: fewer are not worth the compiler's time."""
+_WIDTHS = {"-mavx512f": 8, "-mavx2": 4}
+"""Numbers of double precision in a vector, by the option of the compiler."""
+_DIRECTION = (1.0, 0.7, 1.3)
+"""A direction along which rollouts are sorted by their first place, as along an axis many begin equal."""
 
 
 def lacking(world: World) -> str | None:
@@ -72,7 +80,11 @@ def launch_on_host(structure: Structure, tensors: tuple[Tensor | None, ...], num
     steps = 1 if substeps is None else max(1, int(substeps.sum()))
     threads = threads_for(numbers[0], steps * max(1, structure.contacts))
     share = max(1, min(MOST_AT_ONCE, numbers[0] // (SHARES * threads)))
-    _library(structure).run(*map(ctypes.c_int, (threads, share)), *pointers, *map(ctypes.c_int, numbers))
+    wide = width() if structure.widens and numbers[0] >= LEAST_WIDE else 0
+    order = _order(tensors[0]) if wide and tensors[0] is not None else None
+    first = ctypes.c_void_p(None if order is None else order.data_ptr())
+    share = -(-share // max(wide, 1)) * max(wide, 1)
+    _library(structure, wide).run(*map(ctypes.c_int, (threads, share)), first, *pointers, *map(ctypes.c_int, numbers))
 
 
 def threads_for(rollouts: int, contact_steps: int) -> int:
@@ -81,6 +93,20 @@ def threads_for(rollouts: int, contact_steps: int) -> int:
 
 
 @cache
-def _library(structure: Structure) -> ctypes.CDLL:
-    source = kernel_file("host_prelude") + structure.source(host=True) + kernel_file("host_entry")
-    return kernel_build.host_library(source, FLAGS)
+def width() -> int:
+    """Return how many rollouts of one body one thread simulates at once, in vectors; 0 for one after another."""
+    if Path(kernel_build.compiler() or "").name != "g++":
+        return 0
+    return max((_WIDTHS.get(flag, 0) for flag in kernel_build.vector_flags()), default=0)
+
+
+def _order(table: Tensor) -> Tensor:
+    """Return rollouts in an order in which neighbours begin alike: they then need the same branches; int32, (B,)."""
+    place = table[:, -MOTION_COLUMNS : 3 - MOTION_COLUMNS]
+    return (place @ place.new_tensor(_DIRECTION)).argsort().int()
+
+
+@cache
+def _library(structure: Structure, wide: int = 0) -> ctypes.CDLL:
+    source = kernel_file("host_prelude") + structure.source(host=True, wide=wide) + kernel_file("host_entry")
+    return kernel_build.host_library(source, (*FLAGS, *(kernel_build.vector_flags() if wide else ())))

@@ -29,6 +29,8 @@ FRAME_WIDTH, LABEL_WIDTH, SURFACE_WIDTH = 16, 12, 10
 """Numbers of a body in a frame, of a contact in a label, and of a fixed surface."""
 SHARED_BYTES = 48 * 1024
 """Shared memory that a block of any CUDA device may have without asking for more."""
+_MOST_WIDE = 32
+"""Maximum number of contacts of a body of which several are simulated in one vector: they lie in the cache."""
 _LONG_LIST = 8
 """Number of constants from which a list is an array in memory, and not a chain of comparisons."""
 _BUSY_THREADS = 262_144
@@ -71,6 +73,7 @@ _WIDTHS = {
 """Numbers of a row of the kernels' arrays: of 64 bits there, as products with them may need."""
 
 _FILES = (
+    "wide",  # numbers of several environments at once, on a CPU
     "arithmetic",  # numbers, vectors and rotations, and exchanges between the threads of an environment
     "surface",  # effects of the contact between one body and the ground
     "contact",  # what a contact of a step is
@@ -229,10 +232,23 @@ class Structure:
         """Whether a thread keeps its spheres in registers; the sums of labels take those of eight spheres."""
         return self._unrolled and not (self.record and self.slots > _FREE_SLOTS[False, False])
 
-    def source(self, host: bool = False) -> str:
-        """Return the source: constants, then the files of `kernels/`; for the host without the kernel entry."""
+    @property
+    def widens(self) -> bool:
+        """Whether a CPU can simulate several environments in one vector: one free body above the ground, no records."""
+        alone = self.free == (True,) and not self.paired and self.tree is None and set(self.drives) == {-1}
+        plain = not (self.single or self.dual or self.record or self.carried or self.areas or self.turned)
+        return alone and plain and self.lanes == 1 and self.contacts <= _MOST_WIDE
+
+    def source(self, host: bool = False, wide: int = 0) -> str:
+        """Return the source: constants, then the files of `kernels/`; for the host without the kernel entry.
+
+        Args:
+            host: Whether for the host.
+            wide: Environments in a vector, where the structure `widens`; 0 for one after another.
+        """
         tree = self.tree or Tree()
-        flags = [f"#define {name} {int(value)}" for name, value in (self._flags(host) | _tree_flags(tree)).items()]
+        constants = {"WIDE": wide} | self._flags(host) | _tree_flags(tree)
+        flags = [f"#define {name} {int(value)}" for name, value in constants.items()]
         numbers = [f"#define {name} {value!r}" for name, value in _NUMBERS.items()]
         if self.shared and not host:
             lists = listed_copies(self._copied_lists())

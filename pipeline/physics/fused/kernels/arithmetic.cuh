@@ -1,9 +1,14 @@
 // Numbers (values, or values with derivatives), vectors, rotations, and exchanges between the threads of an environment.
 #define FULL 0xffffffffu
-#if SINGLE
+#if WIDE
+typedef Wide Number;
+#elif SINGLE
 typedef float Number;
 #else
 typedef double Number;
+#endif
+#if !WIDE
+typedef Number Stored;  // a number in an array of the inputs or results
 #endif
 
 __device__ inline float lesser(float a, float b) { return a < b ? a : b; }
@@ -104,19 +109,27 @@ __device__ inline Number plain(Real x) { return x; }
 // Whether a number that multiplies a term is 0, so that the term need not be computed; with derivatives it is needed.
 __device__ inline bool absent(Real x) {
 #if HOST && !DUAL
-    return x == Number(0);
+    return every(x == Number(0));
 #else
     return false;
 #endif
 }
-__device__ inline Real at_least(Real x, Number low) { return plain(x) >= low ? x : Real(low); }
-__device__ inline Real at_most(Real x, Number high) { return plain(x) <= high ? x : Real(high); }
+#if !WIDE
+__device__ inline Real choose(bool condition, Real yes, Real no) { return condition ? yes : no; }
+#endif
+__device__ inline Real at_least(Real x, Number low) { return choose(plain(x) >= low, x, Real(low)); }
+__device__ inline Real at_most(Real x, Number high) { return choose(plain(x) <= high, x, Real(high)); }
 __device__ inline Real square(Real x) { return x * x; }
 
 struct Vec {
     Real x, y, z;
 };
 __device__ inline Vec vec(Real x, Real y, Real z) { Vec v = {x, y, z}; return v; }
+#if WIDE
+inline Vec choose(Flag condition, Vec yes, Vec no) {
+    return vec(choose(condition, yes.x, no.x), choose(condition, yes.y, no.y), choose(condition, yes.z, no.z));
+}
+#endif
 __device__ inline Vec none() { return vec(Real(0), Real(0), Real(0)); }
 __device__ inline Vec operator+(Vec a, Vec b) { return vec(a.x + b.x, a.y + b.y, a.z + b.z); }
 __device__ inline Vec operator-(Vec a, Vec b) { return vec(a.x - b.x, a.y - b.y, a.z - b.z); }
@@ -146,12 +159,10 @@ __device__ inline Quat multiply(Quat a, Quat b) {
 __device__ inline Quat normalized(Quat q) {
     Real norm2 = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z;
 #if HOST && !SINGLE
-    Real off = norm2 - Real(1), s;
-    if (plain(off) < 1e-6 && plain(off) > -1e-6) {  // by a series, exact to rounding, without root and division
-        s = Real(1) - off * (Real(0.5) - Number(0.375) * off);
-    } else {
-        s = inverse_root(norm2);
-    }
+    Real off = norm2 - Real(1);
+    Flag near = (plain(off) < Number(1e-6)) & (plain(off) > Number(-1e-6));
+    Real s = Real(1) - off * (Real(0.5) - Number(0.375) * off);  // a series, exact to rounding, without root and division
+    if (!every(near)) s = choose(near, s, inverse_root(norm2));
 #else
     Real s = inverse_root(norm2);
 #endif
@@ -167,6 +178,19 @@ __device__ inline Quat quat_exp(Vec v) {
                  (Real(Number(-1.0 / 720)) + half2 * Number(1.0 / 40320))));
         sinc = Real(Number(0.5)) + half2 * (Real(Number(-1.0 / 12)) + half2 * (Real(Number(1.0 / 240)) + half2 *
                (Real(Number(-1.0 / 10080)) + half2 * Number(1.0 / 725760))));
+#elif WIDE
+    Real half2 = Number(0.25) * angle2;
+    cosine = Real(1) + half2 * (Real(Number(-1.0 / 2)) + half2 * (Real(Number(1.0 / 24)) + half2 *
+             (Real(Number(-1.0 / 720)) + half2 * (Real(Number(1.0 / 40320)) + half2 * Number(-1.0 / 3628800)))));
+    sinc = Real(Number(0.5)) + half2 * (Real(Number(-1.0 / 12)) + half2 * (Real(Number(1.0 / 240)) + half2 *
+           (Real(Number(-1.0 / 10080)) + half2 * (Real(Number(1.0 / 725760)) +
+                                                  half2 * Number(-1.0 / 79833600)))));
+    Flag small = plain(angle2) < Number(0.04);
+    if (!every(small)) {
+        Real half = Number(0.5) * root(angle2), sine, exact;
+        sine_cosine(half, sine, exact);
+        sinc = choose(small, sinc, sine * reciprocal(Number(2) * half));
+        cosine = choose(small, cosine, exact);
 #elif HOST
     if (plain(angle2) < Number(0.04)) {  // exact to double precision, in a third of the time of a sine
         Real half2 = Number(0.25) * angle2;
@@ -180,10 +204,12 @@ __device__ inline Quat quat_exp(Vec v) {
         cosine = Real(1) - Number(0.125) * angle2;
         sinc = Real(Number(0.5)) - Number(1.0 / 48) * angle2;
 #endif
+#if !WIDE
     } else {
         Real half = Number(0.5) * root(angle2), sine;
         sine_cosine(half, sine, cosine);
         sinc = sine * reciprocal(Number(2) * half);
+#endif
     }
     Quat q = {cosine, sinc * v.x, sinc * v.y, sinc * v.z};
     return q;
@@ -230,8 +256,15 @@ __device__ inline Sym no_inertia() {
 
 // An input that may carry a derivative.
 struct Input {
-    const Number* __restrict__ value;
-    const Number* __restrict__ tangent;  // null: constant
+    const Stored* __restrict__ value;
+    const Stored* __restrict__ tangent;  // null: constant
+#if WIDE
+    Real at(Place place) const {
+        Row row;
+        for (int k = 0; k < WIDE; k++) row[k] = value[place.of[k]];
+        return Real(row);
+    }
+#else
     __device__ Real at(long long index) const {
 #if DUAL
         return Real(value[index], tangent ? tangent[index] : Number(0));
@@ -239,9 +272,11 @@ struct Input {
         return value[index];
 #endif
     }
-    __device__ Vec vector(long long index) const { return vec(at(index), at(index + 1), at(index + 2)); }
+#endif
+    __device__ Vec vector(Place index) const { return vec(at(index), at(index + 1), at(index + 2)); }
 };
 
+#if !WIDE
 struct alignas(16) AlignedRow {
     Number a, b, c, d;
 };
@@ -251,6 +286,7 @@ __device__ inline void write_row(Number* to, Number a, Number b, Number c, Numbe
     AlignedRow row = {a, b, c, d};
     *reinterpret_cast<AlignedRow*>(to) = row;
 }
+#endif
 
 // The LANES neighbouring threads that simulate one environment; all of them hold the same state, or share one copy of
 // it (SHARED). At every exchange between threads the whole warp takes part, even if only some of its environments need
@@ -274,6 +310,9 @@ struct Lanes {
         return __any_sync(FULL, mine);
 #endif
     }
+#if WIDE
+    bool any(Flag mine) const { return some(mine); }
+#endif
     // Sum of the numbers of the lanes before this one, and of all.
     __device__ int before(int mine, int& all) const {
         int sum = mine;

@@ -53,10 +53,10 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, const Ow
         Real radius = problem.geometry.at(row + 3);
 #endif
 #if CULLED
-        if (plain(height) + plain(dot(rotation.z, held)) - plain(radius) > far) continue;
+        if (every(plain(height) + plain(dot(rotation.z, held)) - plain(radius) > far)) continue;
 #endif
-        bool touches = touch_ground(list[i], env.laws[pair_law(p)], motion, rotation * held, height, radius, weights[i]);
-        if (touches) {
+        Flag touches = touch_ground(list[i], env.laws[pair_law(p)], motion, rotation * held, height, radius, weights[i]);
+        if (some(touches)) {
 #if PATCHES
             if (area_start(p) >= 0) {
                 weights[i] = problem.geometry.value[env.geometry + 4LL * area_start(p) + contact - contact_start(p)] * weights[i];
@@ -73,7 +73,10 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, const Ow
 #endif
 #if LISTED
             list[i].slot = SLOT_OF(contact);
-            list[i].impulse = own.before[contact / LANES];
+#if WIDE
+            list[i].on = touches;
+#endif
+            list[i].impulse = WHERE_ON(list[i], own.before[contact / LANES]);
 #endif
         }
 #if !LISTED
@@ -249,7 +252,12 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
     }
 #endif
 #if SURFACE
+#if WIDE
+    Real touching = Real(0);
+    EACH_CONTACT(list, 0, count) touching += choose(list[i].on, Real(1), Real(0));
+#else
     Real touching = Real(own.lanes.sum(Number(count)));
+#endif
     const Sym& J = motions[0].inverse_inertia;
     Real across = reciprocal((J.xx + J.yy) * touching), about = reciprocal(J.zz * touching);
 #endif
@@ -316,12 +324,13 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
 #else
         EACH_CONTACT(list, 0, count) {
             Contact& c = list[i];
-            if (sweep >= 0) c.impulse = swept(c, env.laws[0], motions[0].velocity + cross(motions[0].omega, c.arm));
+            Vec slip = motions[0].velocity + cross(motions[0].omega, c.arm);
+            if (sweep >= 0) c.impulse = WHERE_ON(c, swept(c, env.laws[0], slip));
             linear[0] = linear[0] + c.impulse;
             angular[0] = angular[0] + cross(c.arm, c.impulse);
 #if SURFACE
             if (env.laws[0].surface.twisting) {
-                if (sweep >= 0) c.turning = turned_by(c, env.laws[0], motions[0], across, about);
+                if (sweep >= 0) c.turning = WHERE_ON(c, turned_by(c, env.laws[0], motions[0], across, about));
                 angular[0] = angular[0] + c.turning;
             }
 #endif

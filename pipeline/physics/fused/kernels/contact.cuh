@@ -18,6 +18,9 @@ struct Contact {  // world frame, impulse on body a
 #endif
 #if LISTED
     int slot;  // `SLOT_OF` its number
+#if WIDE
+    Flag on;
+#endif
 #else
     bool on;
 #endif

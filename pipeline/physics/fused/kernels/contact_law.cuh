@@ -91,9 +91,11 @@ INLINE void response_of(const Response& m, Vec normal, Vec turn, Vec& linear, Ve
 // of a spring and a damper. The damper acts for the share of the step in which the gap is closed.
 INLINE Real wanted_speed(Real gap, Real speed, Real step_s, Real inverse_step, Real stiffness, Real damping) {
     Real ahead = gap + step_s * speed, closed = Real(1);
-    if (plain(gap) > Number(0)) {
-        Real way = step_s * (plain(speed) < Number(0) ? -speed : speed);
-        closed = at_most(at_least(-ahead * reciprocal(at_least(way, Number(1e-12))), Number(0)), Number(1));
+    Flag apart = plain(gap) > Number(0);
+    if (some(apart)) {
+        Real way = step_s * choose(plain(speed) < Number(0), -speed, speed);
+        Real share = at_most(at_least(-ahead * reciprocal(at_least(way, Number(1e-12))), Number(0)), Number(1));
+        closed = choose(apart, share, closed);
     }
     return speed - damping * closed * speed - stiffness * at_most(ahead, Number(0)) * inverse_step;
 }
@@ -110,15 +112,16 @@ INLINE Real aim(const Law& law, Real gap, Real speed) {
 // Sets the target velocity of a contact and returns whether it touches. `stop_n` and `stop_t` temporarily hold its
 // effective mass and its tangential mobility, until `share_out` replaces them. `weight` is its weight among redundant
 // contacts.
-INLINE bool prepare(Contact& c, const Law& law, Real gap, Real speed, Real inverse_mass, Real mobility, Real& weight) {
+INLINE Flag prepare(Contact& c, const Law& law, Real gap, Real speed, Real inverse_mass, Real mobility, Real& weight) {
     Real ahead = gap + law.step_s * speed;
     weight = Real(0);
 #if LAWS > 1
     c.friction = law.friction;
 #endif
-    if (!(plain(gap) < Number(0) || plain(ahead) < Number(0))) return false;
-    Real depth = plain(ahead) < plain(gap) ? -ahead : -gap;
-    weight = at_most(at_least(Number(1.0 / ONSET_M) * depth, Number(0)), Number(1));
+    Flag touches = (plain(gap) < Number(0)) | (plain(ahead) < Number(0));
+    if (!some(touches)) return touches;
+    Real depth = choose(plain(ahead) < plain(gap), -ahead, -gap);
+    weight = choose(touches, at_most(at_least(Number(1.0 / ONSET_M) * depth, Number(0)), Number(1)), weight);
     c.target = aim(law, gap, speed);
     c.stop_n = reciprocal(inverse_mass);
     c.stop_t = mobility - inverse_mass;
@@ -126,13 +129,13 @@ INLINE bool prepare(Contact& c, const Law& law, Real gap, Real speed, Real inver
 #if PAIRED
     c.gap = gap;
 #endif
-    return true;
+    return touches;
 }
 
 // Distributes the effective mass among redundant contacts; `total` is the sum of their weights times their redundancy.
 INLINE void share_out(Contact& c, Real total, Real weight) {
     const Real tiny = Real(Number(1e-9));
-    Real share = (weight + tiny) * reciprocal((plain(total) > plain(weight) ? total : weight) + tiny);
+    Real share = (weight + tiny) * reciprocal(choose(plain(total) > plain(weight), total, weight) + tiny);
     c.stop_t = share * reciprocal(c.stop_t);
     c.stop_n = share * c.stop_n;
 }
@@ -162,12 +165,13 @@ INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
     Real most = friction_of(law, c) * along;
 #if HOST
     // where the contact sticks, a predicted branch takes the root and the division out of the chain of iterations
-    bool sticks = plain(wanted2) < Number(1 - 1e-6) * plain(most) * plain(most) - Number(1e-24);
+    Flag sticks = plain(wanted2) < Number(1 - 1e-6) * plain(most) * plain(most) - Number(1e-24);
 #else
-    const bool sticks = false;
+    const Flag sticks = false;
 #endif
     // the tiny number keeps the derivative of a contact without impulses finite
-    Real scale = sticks ? Real(1) : most * inverse_root(wanted2 + Real(Number(1e-24)));
+    Real scale = Real(1);
+    if (!every(sticks)) scale = choose(sticks, scale, most * inverse_root(wanted2 + Real(Number(1e-24))));
     scale = at_most(scale, Number(1));
 #if PAIRED
     return along * c.normal + scale * wanted;
@@ -206,7 +210,7 @@ INLINE Real crowd(const Moments& m, const Moving& a, const Contact& c) {
 }
 
 // Prepares a contact with the ground, whose normal is z; `arm` is the lever arm of the sphere's centre.
-INLINE bool touch_ground(Contact& c, const Law& law, const Moving& a, Vec arm, Real height, Real radius,
+INLINE Flag touch_ground(Contact& c, const Law& law, const Moving& a, Vec arm, Real height, Real radius,
                          Real& weight) {
     const Sym& J = a.inverse_inertia;
     c.arm = vec(arm.x, arm.y, arm.z - radius);

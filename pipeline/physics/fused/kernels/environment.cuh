@@ -11,12 +11,12 @@ struct Problem {
     const int* __restrict__ spheres;       // of each contact: row of the geometry
     const int* __restrict__ drive_starts;  // of each driven body: row of its first sample
     const int* __restrict__ drive_last;    // (1 or environments, driven bodies): index of the last interval
-    const Number* __restrict__ mesh_numbers;  // of each mesh, see `TriangleMesh`
+    const Stored* __restrict__ mesh_numbers;  // of each mesh, see `TriangleMesh`
     const int* __restrict__ mesh_indices;
-    Number* __restrict__ frames;           // (environments, frames, bodies, FRAME_WIDTH)
-    Number* __restrict__ frame_tangents;
-    Number* __restrict__ labels;           // (environments, frames, contacts, LABEL_WIDTH)
-    Number* carried;                       // (environments, LANES, CARRIED_WIDTH): see `resume`
+    Stored* __restrict__ frames;           // (environments, frames, bodies, FRAME_WIDTH)
+    Stored* __restrict__ frame_tangents;
+    Stored* __restrict__ labels;           // (environments, frames, contacts, LABEL_WIDTH)
+    Stored* carried;                       // (environments, LANES, CARRIED_WIDTH): see `resume`
     int environments, frame_count, sweeps;
     long long steps_stride, geometry_stride, drive_stride;
     int drive_last_stride;
@@ -97,7 +97,7 @@ struct StepRoom {
 #endif
 
 struct Common {  // what the lanes of an environment have in common
-    long long index, geometry, steps, drives, surfaces;
+    Place index, geometry, steps, drives, surfaces;
     int drive_last;
     Vec gravity;
     Real ground;
@@ -146,7 +146,7 @@ INLINE const Weight& weight(const Environment& env, int b) { return env.constant
 // Reads the numbers of an environment at the start.
 INLINE void load(const Problem& problem, Environment& env, Own& own) {
     const Input& table = problem.table;
-    long long at = env.index * TABLE_WIDTH;
+    Place at = env.index * TABLE_WIDTH;
     env.gravity = table.vector(at);
     env.ground = table.at(at + 3);
     at += 4;
@@ -201,7 +201,7 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
 #if LINKS
     at = load_chain(table, at, own.lanes, env.chain);
 #endif
-    const long long bodies = at;
+    const Place bodies = at;
     EACH_BODY
     DIVIDED(own.lanes, b, BODIES) {
         Body& body = env.bodies[b];
@@ -231,8 +231,10 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
             c.high[k] = Number(-1e30);
         }
 #endif
-        const Number* sphere = problem.geometry.value + env.geometry + 4LL * sphere_start(b);
-        for (int i = 0; i < sphere_count(b); i++, sphere += 4) {
+        Place row = env.geometry + 4LL * sphere_start(b);
+        for (int i = 0; i < sphere_count(b); i++, row += 4) {
+            const Number sphere[4] = {plain(problem.geometry.at(row)), plain(problem.geometry.at(row + 1)),
+                                      plain(problem.geometry.at(row + 2)), plain(problem.geometry.at(row + 3))};
             Number x = sphere[0] - plain(c.com.x), y = sphere[1] - plain(c.com.y), z = sphere[2] - plain(c.com.z);
             c.reach = greater(c.reach, root(x * x + y * y + z * z) + sphere[3]);
 #if PAIRED
@@ -262,7 +264,7 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
         int contact = i * LANES + own.lanes.lane;
-        long long row = env.geometry + 4LL * (contact < CONTACTS ? problem.spheres[contact] : 0);
+        Place row = env.geometry + 4LL * (contact < CONTACTS ? problem.spheres[contact] : 0);
         own.arms[i] = problem.geometry.vector(row) - env.constants[0].com;
         own.radii[i] = problem.geometry.at(row + 3);
     }

@@ -23,7 +23,7 @@ INLINE void stick(const Problem& problem, const Environment& env, const Lanes& l
     Real sum = Real(0), most = Real(0), each = reciprocal(s.reach);
     Vec arms = none();
     for (int k = lanes.lane; k < low_count(b); k += LANES) {
-        long long row = env.geometry + 4LL * problem.spheres[low_start(b) + k];
+        Place row = env.geometry + 4LL * problem.spheres[low_start(b) + k];
         Vec arm = rotation * (problem.geometry.vector(row) - env.constants[b].com);
         arm.z = arm.z - problem.geometry.at(row + 3);
         Real far = each * (env.bodies[b].position.z - env.ground + arm.z);
@@ -31,7 +31,7 @@ INLINE void stick(const Problem& problem, const Environment& env, const Lanes& l
         Real near = square(Real(Number(1)) - far * far);
         sum += near;
         arms = arms + near * arm;
-        if (plain(near) > plain(most)) most = near;
+        most = choose(plain(near) > plain(most), near, most);
     }
     sum = lanes.sum(sum);
     arms = lanes.sum(arms);
@@ -50,10 +50,10 @@ __device__ Real height_of(const Problem& problem, const Environment& env, const 
                           const Mat& rotation) {
     Real lowest = Real(Number(1e30));
     for (int k = lanes.lane; k < low_count(b); k += LANES) {
-        long long row = env.geometry + 4LL * problem.spheres[low_start(b) + k];
+        Place row = env.geometry + 4LL * problem.spheres[low_start(b) + k];
         Vec arm = problem.geometry.vector(row) - env.constants[b].com;
         Real low = dot(rotation.z, arm) - problem.geometry.at(row + 3);
-        if (plain(low) < plain(lowest)) lowest = low;
+        lowest = choose(plain(low) < plain(lowest), low, lowest);
     }
     return at_least(env.bodies[b].position.z - env.ground + lanes.least(lowest), Number(0));
 }

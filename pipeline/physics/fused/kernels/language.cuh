@@ -4,7 +4,11 @@
 // Loops over bodies, slots and laws are unrolled where the numbers of all rounds fit into registers: an array of registers
 // has no places that are computed. SPREAD is always unrolled, KEEP_LOOP never: it would only be more code to fetch.
 #if HOST
+#if WIDE
+#define INLINE inline __attribute__((always_inline))
+#else
 #define INLINE inline
+#endif
 #define EACH_BODY
 #define EACH_SLOT
 #define EACH_PAIR
@@ -90,6 +94,12 @@
 #define UP_DOFS(lanes, d) for (int d = DOFS - 1; d >= 0; d--)
 #endif
 #define DEEP (MESHES || HULLS)  // labels have gaps weighted by impulses, where slots may have nothing at the frame
+// An impulse, or 0 in environments where the contact is not on.
+#if WIDE
+#define WHERE_ON(c, impulse) choose((c).on, impulse, none())
+#else
+#define WHERE_ON(c, impulse) (impulse)
+#endif
 #if QUEUED
 #define SLOT_OF(contact) (contact)
 #else

@@ -1,9 +1,9 @@
 // Which bodies may touch in a step, and the contact of a slot; formulas of `physics/contact_detection.py`.
 // Whether a body may touch the ground in this step, by the sphere around its centre of mass.
-INLINE bool near_ground(const Environment& env, int b, const Motion& m) {
+INLINE Flag near_ground(const Environment& env, int b, const Motion& m) {
     Number low = plain(env.bodies[b].position.z - env.ground) - env.constants[b].reach;
     Number rate = plain(m.velocity.z) - size(m.omega) * env.constants[b].reach;
-    return low < Number(1e-6) || low + plain(env.laws[0].step_s) * rate < Number(1e-6);
+    return (low < Number(1e-6)) | (low + plain(env.laws[0].step_s) * rate < Number(1e-6));
 }
 
 #if PAIRED

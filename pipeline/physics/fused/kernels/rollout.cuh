@@ -69,7 +69,7 @@ INLINE void step(const Problem& problem, Environment& env, Own& own, Real time_a
 #endif
 }
 
-INLINE void write_vector(const Problem& problem, long long at, Vec v) {
+INLINE void write_vector(const Problem& problem, Place at, Vec v) {
     write_row(problem.frames + at, plain(v.x), plain(v.y), plain(v.z), Number(0));
 #if DUAL
     write_row(problem.frame_tangents + at, v.x.tangent, v.y.tangent, v.z.tangent, Number(0));
@@ -91,7 +91,7 @@ INLINE void write_frame(const Problem& problem, const Environment& env, const La
             position = position - arm;
             velocity = velocity - cross(R * omega, arm);
         }
-        long long at = FRAME_WIDTH * ((env.index * problem.frame_count + frame) * BODIES + b);
+        Place at = FRAME_WIDTH * ((env.index * problem.frame_count + frame) * BODIES + b);
         Quat q = body.quat;
         write_vector(problem, at, position);
         write_row(problem.frames + at + 4, plain(q.w), plain(q.x), plain(q.y), plain(q.z));
@@ -237,7 +237,7 @@ INLINE void write(const Problem& problem, Environment& env, Own& own, int frame)
 }
 
 // Simulates one environment; called by all of its lanes.
-INLINE void roll(const Problem& problem, int index, Lanes lanes, Environment& env) {
+INLINE void roll(const Problem& problem, Place index, Lanes lanes, Environment& env) {
 #if SHARED
     Own own;
 #else
@@ -250,7 +250,9 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes, Environment& en
     env.geometry = index * problem.geometry_stride;
     env.surfaces = index * problem.surface_stride;
     env.drives = index * problem.drive_stride;
+#if DRIVEN
     env.drive_last = index * problem.drive_last_stride;
+#endif
     lanes.sync();
     load(problem, env, own);
 #if CARRIED
@@ -275,7 +277,7 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes, Environment& en
     write(problem, env, own, 0);
     KEEP_LOOP
     for (int frame = 1; frame < problem.frame_count; frame++) {
-        long long row = env.steps + (long long)STEP_WIDTH * (frame - 1);
+        Place row = env.steps + (long long)STEP_WIDTH * (frame - 1);
         Real step_s = problem.steps.at(row), inverse_step = reciprocal(step_s);
         EACH_LAW
         for (int l = 0; l < LAWS; l++) {
@@ -303,11 +305,11 @@ INLINE void roll(const Problem& problem, int index, Lanes lanes, Environment& en
 }
 
 #define PARAMETERS                                                                                                   \
-    const Number *table, const Number *table_t, const Number *steps, const Number *steps_t, const Number *geometry,  \
-        const Number *geometry_t, const Number *surfaces, const Number *surfaces_t, const Number *drives,            \
-        const Number *drives_t, const int *substeps, const int *spheres, const int *drive_starts,                    \
-        const int *drive_last, const Number *mesh_numbers, const int *mesh_indices, Number *frames,                  \
-        Number *frame_tangents, Number *labels, Number *carried, int environments, int frame_count, int sweeps,      \
+    const Stored *table, const Stored *table_t, const Stored *steps, const Stored *steps_t, const Stored *geometry,  \
+        const Stored *geometry_t, const Stored *surfaces, const Stored *surfaces_t, const Stored *drives,            \
+        const Stored *drives_t, const int *substeps, const int *spheres, const int *drive_starts,                    \
+        const int *drive_last, const Stored *mesh_numbers, const int *mesh_indices, Stored *frames,                  \
+        Stored *frame_tangents, Stored *labels, Stored *carried, int environments, int frame_count, int sweeps,      \
         int steps_stride, int geometry_stride, int surface_stride, int drive_stride, int drive_last_stride
 #define PROBLEM                                                                                                      \
     {                                                                                                                \

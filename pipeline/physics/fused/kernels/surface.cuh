@@ -13,10 +13,9 @@ struct Surface {
 
 // The quadratic B-spline of width 3.
 INLINE Real spline(Real x) {
-    if (plain(x) < Number(0)) x = -x;
-    if (plain(x) < Number(0.5)) return Real(Number(0.75)) - x * x;
+    x = choose(plain(x) < Number(0), -x, x);
     Real far = at_least(Real(Number(1.5)) - x, Number(0));
-    return Number(0.5) * far * far;
+    return choose(plain(x) < Number(0.5), Real(Number(0.75)) - x * x, Number(0.5) * far * far);
 }
 
 // Friction of a contact at (x, y) with slip velocity (u, v), both along the axes of the ground.
@@ -42,15 +41,12 @@ INLINE void damp(const Surface& s, Real step_s, Real fast, Real& stiffness, Real
     Real grows = Real(Number(3.28)) + Number(1.16) * ratio;
     ratio += Number(0.375) * (Real(Number(1)) + ratio * grows) * s.restitution * fast;
     Real eta = step_s * reciprocal(s.time), gap = Real(Number(1)) - ratio * ratio;
-    bool below = plain(gap) > Number(0);
-    Real safe = below ? gap : -gap;
-    if (plain(safe) < Number(1e-12)) safe = Real(Number(1e-12));
+    Flag below = plain(gap) > Number(0);
+    Real safe = choose(below, gap, -gap);
+    safe = choose(plain(safe) < Number(1e-12), Real(Number(1e-12)), safe);
     Real angle = root(safe) * eta, decay = exponential(-(ratio * eta)), sine, cosine;
-    if (below) {
-        sine_cosine(angle, sine, cosine);
-    } else {
-        cosine = Number(0.5) * (exponential(angle) + exponential(-angle));
-    }
+    if (some(below)) sine_cosine(angle, sine, cosine);
+    if (!every(below)) cosine = choose(below, cosine, Number(0.5) * (exponential(angle) + exponential(-angle)));
     Real trace = Number(2) * decay * cosine, determinant = decay * decay;
     stiffness = Real(Number(1)) + determinant - trace;
     damping = Number(0.5) * (Real(Number(3)) - trace - determinant) - stiffness;
@@ -63,7 +59,7 @@ INLINE void response(const Surface& s, Real step_s, Real speed, Real& stiffness,
         damping = s.damping;
         return;
     }
-    damp(s, step_s, plain(speed) < Number(0) ? -speed : speed, stiffness, damping);
+    damp(s, step_s, choose(plain(speed) < Number(0), -speed, speed), stiffness, damping);
 }
 
 #if ELLIPTIC
@@ -76,17 +72,18 @@ INLINE Ellipse ellipse_of(const Surface& s, Real friction) {
     Real radius = root(s.even * s.even + s.mixed * s.mixed + Real(Number(1e-24)));
     Real high = at_least(friction + radius, Number(LEAST_FRICTION));
     Ellipse e = {friction, s.even, s.mixed};
-    if (plain(friction - radius) < Number(FLATTEST) * plain(high)) {
+    Flag flat = plain(friction - radius) < Number(FLATTEST) * plain(high);
+    if (some(flat)) {
         Real scale = Number(0.5 * (1 - FLATTEST)) * high * reciprocal(radius);
-        e.mean = Number(0.5 * (1 + FLATTEST)) * high;
-        e.even = scale * s.even;
-        e.mixed = scale * s.mixed;
+        e.mean = choose(flat, Number(0.5 * (1 + FLATTEST)) * high, e.mean);
+        e.even = choose(flat, scale * s.even, e.even);
+        e.mixed = choose(flat, scale * s.mixed, e.mixed);
     }
     return e;
 }
 
 INLINE Real share_of(Real size, Real limit) {
-    return size * reciprocal(plain(limit) >= Number(1e-9) * plain(size) ? limit : Number(1e-9) * size);
+    return size * reciprocal(choose(plain(limit) >= Number(1e-9) * plain(size), limit, Number(1e-9) * size));
 }
 
 // Projects an impulse onto the ellipse |M^-1 j| <= limit.
@@ -98,13 +95,21 @@ INLINE void put_in(const Ellipse& e, Real limit, Real& x, Real& y) {
     Number along = mean * plain(x) - even * plain(x) - mixed * plain(y);
     Number across = mean * plain(y) - mixed * plain(x) + even * plain(y);
     Number most = plain(limit) * (mean * mean - even * even - mixed * mixed);
-    if (along * along + across * across < Number(1 - 1e-6) * most * most - Number(1e-24)) return;
-    if (absent(e.even) && absent(e.mixed)) {
+    Flag done = along * along + across * across < Number(1 - 1e-6) * most * most - Number(1e-24);
+    if (every(done)) return;
+    Flag round_one = (plain(e.even) == Number(0)) & (plain(e.mixed) == Number(0)) & !done;
+#if DUAL
+    round_one = false;  // its derivative by the direction is not 0
+#endif
+    if (some(round_one)) {
         Real scale = at_most(limit * e.mean * inverse_root(x * x + y * y + tiny), Number(1));
-        x = scale * x;
-        y = scale * y;
-        return;
+        x = choose(round_one, scale * x, x);
+        y = choose(round_one, scale * y, y);
+        done = done | round_one;
     }
+    if (every(done)) return;
+#else
+    Flag done = false;
 #endif
     Real square = e.even * e.even + e.mixed * e.mixed, twice = Number(2) * e.mean;
     Real half_trace = e.mean * e.mean + square, root_det = e.mean * e.mean - square;
@@ -113,23 +118,26 @@ INLINE void put_in(const Ellipse& e, Real limit, Real& x, Real& y) {
     Real two_x = e.mean * turned_x + square * x, two_y = e.mean * turned_y + square * y;
     Real high = e.mean + root(square + tiny), u, v;
     Real t = at_least(share_of(root(one_x * one_x + one_y * one_y + tiny), limit) - high * high, Number(0));
-    bool close = false;  // the last step was so small that another one would change only rounding
+    Flag close = false;  // the last step was so small that another one would change only rounding
     for (int round = 0;; round++) {
         Real inverse = reciprocal(t * t + Number(2) * half_trace * t + root_det * root_det), first = half_trace + t;
         u = inverse * (first * one_x - twice * two_x);
         v = inverse * (first * one_y - twice * two_y);
         Real size2 = u * u + v * v + tiny;
-        if (close || round == NEWTON_STEPS) {
+        Flag ends = (close | Flag(round == NEWTON_STEPS)) & !done;
+        if (some(ends)) {
             Real scale = at_most(limit * inverse_root(size2), Number(1));
-            x = scale * (e.mean * u + e.even * u + e.mixed * v);
-            y = scale * (e.mean * v + e.mixed * u - e.even * v);
-            return;
+            x = choose(ends, scale * (e.mean * u + e.even * u + e.mixed * v), x);
+            y = choose(ends, scale * (e.mean * v + e.mixed * u - e.even * v), y);
+            done = done | ends;
+            if (every(done)) return;
         }
         Real bent = e.even * (u * u - v * v) + Number(2) * e.mixed * u * v;
         bent = inverse * (first * size2 - twice * bent);
         Real beyond = share_of(root(size2), limit) - Real(Number(1));
-        if (plain(t) == Number(0) && plain(beyond) <= Number(0)) return;  // it lies in the ellipse
-        close = plain(beyond) < Number(CLOSE) && plain(beyond) > Number(-CLOSE);
+        done = done | ((plain(t) == Number(0)) & (plain(beyond) <= Number(0)));  // it lies in the ellipse
+        if (every(done)) return;
+        close = (plain(beyond) < Number(CLOSE)) & (plain(beyond) > Number(-CLOSE));
         t = at_least(t + size2 * reciprocal(bent) * beyond, Number(0));
     }
 }

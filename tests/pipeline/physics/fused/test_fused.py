@@ -19,7 +19,7 @@ from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
 from cgwm.pipeline.physics.effects.residual_wrench import AXES, ResidualWrench
-from cgwm.pipeline.physics.fused import simulate_fused, unsupported
+from cgwm.pipeline.physics.fused import host, simulate_fused, unsupported
 from cgwm.pipeline.physics.fused.host import lacking, simulate_on_host
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
@@ -777,6 +777,33 @@ def test_threads_change_no_bit_on_the_cpu() -> None:
     finally:
         torch.set_num_threads(before)
     same_bits(*found)
+
+
+def unlike(count: int) -> tuple[World, State]:
+    """Return boxes that begin in the air and on the ground, each second one without any effect of its contact."""
+    mine = (torch.arange(count) % 2).to(F64)
+    effects = [active("ground_magnet", A=4.0, l=0.1), active("linear_drag", c=mine.tolist())]
+    for name, values in SURFACE_VALUES.items():
+        constants = {"v_s", "p", "g"}
+        effects.append(active(name, **{k: v if k in constants else (v * mine).tolist() for k, v in values.items()}))
+    world = replace(world_of(cube(side=2, half=0.04)), effects=tuple(effects))
+    state = tossed(count)
+    height = torch.linspace(0.0, 0.2, count, dtype=F64)[torch.arange(count) * 5 % count]
+    return world, replace(state, position_m=state.position_m + torch.stack((0 * height, height, height), -1)[:, None])
+
+
+@NEEDS_COMPILER
+@pytest.mark.skipif(host.width() == 0, reason="needs vectors of four numbers")
+@pytest.mark.parametrize("case", ["numbers", "effects"])
+def test_vectors_of_rollouts_change_no_bit_on_the_cpu(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+    world, state, frames = varied(21) if case == "numbers" else (*unlike(21), times(0.15))
+    sorts = []
+    monkeypatch.setattr(host, "_order", lambda table: sorts.append(len(table)) or torch.randperm(len(table)).int())
+    found = simulate_on_host(world, state, frames)
+    assert sorts == [21]
+    monkeypatch.setattr(host, "width", lambda: 0)
+    same_bits(simulate_on_host(world, state, frames), found)
+    assert found.velocity_m_s.isfinite().all()
 
 
 @NEEDS_COMPILER
