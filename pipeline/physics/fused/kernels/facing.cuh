@@ -45,11 +45,15 @@ INLINE void part_by(const Problem& problem, const Environment& env, int b, int o
         Vec normal = rotations[b] * problem.geometry.vector(hull.row + 12LL * i);
         Vec within = transposed(rotations[other], normal);
         Number x = plain(within.x), y = plain(within.y), z = plain(within.z), least = Number(1e30);
+        const Number height = hull.affine(i, 0, from);
         for (int k = 0; k < its.supports; k++) {
             const Number* s = its.support(k);
             least = lesser(least, x * s[0] + y * s[1] + z * s[2] - s[3]);
+#if HOST
+            if (!(least + height > most)) break;
+#endif
         }
-        least += hull.affine(i, 0, from);
+        least += height;
         if (!(least > most)) continue;
         most = least;
         axis[0] = sign * plain(normal.x);
@@ -79,13 +83,28 @@ INLINE int flat_face(const Problem& problem, const Environment& env, int b, cons
 const int NEAR_ROOM = 32;
 struct Near {  // edges of a hull that are near another one; all of them where more are than there is room for
     int count, listed[NEAR_ROOM];
+#if HOST
+    unsigned long long marks;  // of the listed edges by their number modulo 64
+#endif
+    INLINE void clear() {
+        count = 0;
+#if HOST
+        marks = 0;
+#endif
+    }
     INLINE int many(int ridges) const { return count < 0 ? ridges : count; }
     INLINE int edge(int i) const { return count < 0 ? i : listed[i]; }
     INLINE void add(int edge) {
         if (count == NEAR_ROOM) count = -1;
         if (count >= 0) listed[count++] = edge;
+#if HOST
+        marks |= 1ULL << (edge & 63);
+#endif
     }
     INLINE bool has(int edge) const {
+#if HOST
+        if (count >= 0 && !(marks >> (edge & 63) & 1)) return false;
+#endif
         bool found = count < 0;
         for (int i = 0; i < count; i++) found = found || listed[i] == edge;
         return found;
@@ -99,11 +118,22 @@ struct Parting {  // how two hulls part best
     Mat turn;        // of the frame of b into that of a, with `shift`
     Vec shift;
     Near near_a, near_b;
+#if HOST
+    Edge placed_b[NEAR_ROOM];  // the near edges of b in the frame of a, where there is room for them
+#endif
 };
 
 // The edge of body b in the frame of body a.
 INLINE Edge edge_in(const Parting& parting, const Hull& hull_b, int i) {
     return placed_edge(edge_of(hull_b, i), parting.turn, parting.shift);
+}
+
+// The near edge number `n` of body b in the frame of body a.
+INLINE Edge near_edge(const Parting& parting, const Hull& hull_b, int n) {
+#if HOST
+    if (parting.near_b.count >= 0) return parting.placed_b[n];
+#endif
+    return edge_in(parting, hull_b, parting.near_b.edge(n));
 }
 
 // Whether an edge is farther than a margin from the box of a body's spheres, all in the frame of that body.
@@ -120,7 +150,8 @@ INLINE bool edge_beside(const Constants& body, Vec start, Vec along, Number marg
 // Lists the edges of both hulls that are within a margin of the other body's box.
 INLINE void find_near(const Environment& env, int a, int b, const Hull& hull_a, const Hull& hull_b, Number margin,
                       Parting& found) {
-    found.near_a.count = found.near_b.count = 0;
+    found.near_a.clear();
+    found.near_b.clear();
     for (int i = 0; i < hull_a.ridges && found.near_a.count >= 0; i++) {
         Edge edge = edge_of(hull_a, i);
         Vec start = transposed(found.turn, edge.start - found.shift), along = transposed(found.turn, edge.along);
@@ -178,12 +209,16 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
     found.shift = transposed(R, env.bodies[b].position - Q * env.constants[b].com - env.bodies[a].position);
     found.shift = found.shift + env.constants[a].com;
     find_near(env, a, b, hull_a, hull_b, limit + Number(SMOOTHING_M), found);
+#if HOST
+    for (int n = 0; n < found.near_b.count; n++) found.placed_b[n] = edge_in(found, hull_b, found.near_b.edge(n));
+#endif
     Number most = found.gap;
     for (int n = 0; n < found.near_b.many(hull_b.ridges); n++) {
-        Edge second = edge_in(found, hull_b, found.near_b.edge(n));
+        Edge second = near_edge(found, hull_b, n);
         for (int m = 0; m < found.near_a.many(hull_a.ridges); m++) {
             Crossing crossing;
-            if (!cross_edges(edge_of(hull_a, found.near_a.edge(m)), second, crossing)) continue;
+            const Edge first = edge_of(hull_a, found.near_a.edge(m));
+            if (surely_lean(first, second, Number(0)) || !cross_edges(first, second, crossing)) continue;
             if (crossing.lean > Number(0) || !(plain(crossing.gap) > most)) continue;
             most = plain(crossing.gap);
             Vec normal = rotations[a] * crossing.normal;
@@ -216,13 +251,13 @@ __device__ bool face_edges(const Problem& problem, const Environment& env, int p
     int other = -1;
     for (int n = 0; n < parting.near_b.many(hull_b.ridges); n++) {
         Crossing crossing;
-        int j = parting.near_b.edge(n);
-        if (!cross_edges(first, edge_in(parting, hull_b, j), crossing)) continue;
-        if (!crossing.within || crossing.leaves != (slot % 2 == 1)) continue;
+        const Edge second = near_edge(parting, hull_b, n);
+        if (edge_leaves(first, second) != (slot % 2 == 1) || surely_lean(first, second, Number(OUT_OF_FACE))) continue;
+        if (!cross_edges(first, second, crossing) || !crossing.within) continue;
         if (crossing.lean > Number(OUT_OF_FACE) || !(plain(dot(crossing.normal, axis)) > Number(PARALLEL))) continue;
         if (!(plain(crossing.gap) < least)) continue;
         least = plain(crossing.gap);
-        other = j;
+        other = parting.near_b.edge(n);
     }
     if (other < 0) return false;
     Crossing crossing;

@@ -74,6 +74,26 @@ struct Crossing {  // the common normal of two edges, out of the first body
     bool leaves;  // whether the first edge, from its first to its second end, leaves the other body
 };
 
+// Whether two edges lean by more than a bound, up to rounding, without the root that their normal needs: most do. Threads
+// of a warp would wait for those that do not.
+INLINE bool surely_lean(const Edge& first, const Edge& second, Number bound) {
+#if !HOST
+    return false;
+#else
+    const Vec over = cross(first.along, second.along);
+    const Number side = plain(dot(first.inward + first.other_inward, over)) > Number(0) ? Number(-1) : Number(1);
+    const Number most = greater(greater(side * plain(dot(over, first.inward)), side * plain(dot(over, first.other_inward))),
+                                -lesser(side * plain(dot(over, second.inward)), side * plain(dot(over, second.other_inward))));
+    const Number least = bound + Number(1e-6);
+    return most > Number(0) && most * most > least * least * plain(dot(over, over));
+#endif
+}
+
+// Whether the first edge, from its first to its second end, leaves the body of the second.
+INLINE bool edge_leaves(const Edge& first, const Edge& second) {
+    return plain(dot(second.inward + second.other_inward, first.along)) < Number(0);
+}
+
 // Returns false for edges that are nearly parallel.
 INLINE bool cross_edges(const Edge& first, const Edge& second, Crossing& found) {
     Vec over = cross(first.along, second.along), apart = second.start - first.start;
@@ -89,7 +109,7 @@ INLINE bool cross_edges(const Edge& first, const Edge& second, Crossing& found) 
                 other * second.widening;
     found.lean = greater(greater(plain(dot(found.normal, first.inward)), plain(dot(found.normal, first.other_inward))),
                          -lesser(plain(dot(found.normal, second.inward)), plain(dot(found.normal, second.other_inward))));
-    found.leaves = plain(dot(second.inward + second.other_inward, first.along)) < Number(0);
+    found.leaves = edge_leaves(first, second);
     found.within = plain(found.place) >= Number(0) && plain(found.place) <= Number(1) && plain(other) >= Number(0) &&
                    plain(other) <= Number(1);
     return true;

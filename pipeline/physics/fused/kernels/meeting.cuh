@@ -56,6 +56,31 @@ INLINE bool boxes_apart(const Constants& ours, const Constants& other, const Fra
     return false;
 }
 
+INLINE Number sum_of_sides(Vec v) {
+    const Number x = plain(v.x), y = plain(v.y), z = plain(v.z);
+    return (x < Number(0) ? -x : x) + (y < Number(0) ? -y : y) + (z < Number(0) ? -z : z);
+}
+
+// Whether two bodies are surely farther apart than they may come in a step, without roots: sides add up to no less than
+// the size, and 1 / (1 - x) is at most 1 + 2 x for x up to 1/2.
+INLINE bool far_apart(const Constants& ca, const Constants& cb, const Motion& ma, const Motion& mb, Vec between, Number h) {
+    const Number spin_a = sum_of_sides(ma.omega), spin_b = sum_of_sides(mb.omega), x = Number(0.5) * h * (spin_a + spin_b);
+    const Number reach_a = ca.reach + Number(SMOOTHING_M), reach_b = cb.reach + Number(SMOOTHING_M);
+    const Number most = h * (sum_of_sides(ma.velocity - mb.velocity) + spin_a * reach_a + spin_b * reach_b);
+    const Number far = Number(1 + 1e-4) * (reach_a + reach_b + most * (Number(1) + Number(2) * x)) + Number(2e-6);
+    return x < Number(0.5) && plain(dot(between, between)) > far * far;
+}
+
+// Whether the ball around a body's centre of mass is beyond a side of the box of another body by more than a margin.
+INLINE bool ball_apart(const Constants& ours, const Constants& other, const Mat& rotation, Vec between, Number margin) {
+    const Vec place = transposed(rotation, between) + other.com;
+    const Number at[3] = {plain(place.x), plain(place.y), plain(place.z)}, bound = ours.reach + margin;
+    for (int i = 0; i < 3; i++) {
+        if (at[i] - bound > other.high[i] || at[i] + bound < other.low[i]) return true;
+    }
+    return false;
+}
+
 struct Reach {  // how far the points of two bodies may come in a step
     Number near, limit;
     Frame frames[2];  // of b in a, of a in b
@@ -66,6 +91,10 @@ INLINE bool may_touch(const Environment& env, int p, const Mat* rotations, const
     int a = pair_a(p), b = pair_b(p);
     const Constants &ca = env.constants[a], &cb = env.constants[b];
     const Motion &ma = motions[a], &mb = motions[b];
+#if HOST
+    const Vec between = env.bodies[a].position - env.bodies[b].position;
+    if (far_apart(ca, cb, ma, mb, between, plain(env.laws[0].step_s))) return false;
+#endif
     // points at a gap g approach at V + W g / 2 at most, so those beyond h V / (1 - h W / 2) cannot touch in this step
     Number spins = size(ma.omega) + size(mb.omega), h = plain(env.laws[0].step_s);
     Number V = size(ma.velocity - mb.velocity) + size(ma.omega) * (ca.reach + Number(SMOOTHING_M)) +
@@ -77,6 +106,9 @@ INLINE bool may_touch(const Environment& env, int p, const Mat* rotations, const
     Number apart = size(env.bodies[a].position - env.bodies[b].position);
     if (!(apart - ca.reach - cb.reach - Number(SMOOTHING_M) < reach.limit)) return false;
     const Number margin = Number(1 + 1e-5) * (reach.limit + Number(SMOOTHING_M));
+#if HOST
+    if (ball_apart(cb, ca, rotations[a], -between, margin) || ball_apart(ca, cb, rotations[b], between, margin)) return false;
+#endif
     INNER
     for (int side = 0; side < 2; side++) {
         reach.frames[side] = frame_in(env, side ? a : b, side ? b : a, rotations);
