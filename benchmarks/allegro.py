@@ -31,9 +31,10 @@ from cgwm.datasets.models.model import Model
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant
+from cgwm.pipeline.runtime.resources import no_garbage_search
 from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
 from cgwm.schemas import ContactParameters, HandTask
-from known_object import errors_of, known_object
+from known_object import SPREAD, errors_of, known_object, sensing_of
 from store import Store
 
 mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs
@@ -63,7 +64,7 @@ def scene_of(repository: Path, folder: Path, name: str) -> Path:
     return scene
 
 
-def model_of(scene: Path, corners: int) -> Model:
+def model_of(scene: Path, corners: int, spread: float = 0.0) -> Model:
     """Return the model of the object of a scene, with the scene's numbers."""
     found = mujoco.MjModel.from_xml_path(str(scene))
     body = found.body("obj").id
@@ -80,7 +81,7 @@ def model_of(scene: Path, corners: int) -> Model:
     inertia = inertial.reshape(3, 3) @ np.diag(found.body_inertia[body]) @ inertial.reshape(3, 3).T
     contact = ContactParameters(friction=FRICTION, contact_time_s=CONTACT_TIME_S, damping_ratio=DAMPING_RATIO)
     balls = rounded_hull(points, corners)
-    return known_object(balls, float(found.body_mass[body]), inertia, found.body_ipos[body], contact)
+    return known_object(balls, float(found.body_mass[body]), inertia, found.body_ipos[body], contact, spread)
 
 
 def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> HandTask:
@@ -120,6 +121,7 @@ def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
                 "turn_deg": math.degrees(2 * math.acos(math.sqrt(0.96))), "hold_s": 2.1, "drop_m": 0.1, "goals": 1,
                 "timeout_s": 50.0,
             },
+            "sensing": sensing_of(given.plant),
             "limits": {"speed_rad_s": given.speed},
             "plant": {
                 "kind": "mujoco", "scene": str(scene.relative_to(folder)), "body": "obj", **errors_of(given.plant),
@@ -135,11 +137,13 @@ def measure(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
     task = task_of(folder, scene, seed, given)
     # some starts overlap with the thumb, and the wanted place with the fingers at the start: a task may ask neither
     above = task.start.model_copy(update={"position_m": (*task.start.position_m[:2], ABOVE_M)})
-    controller = HandController(model_of(scene, given.corners), task.model_copy(update={"start": above}))
+    model = model_of(scene, given.corners, SPREAD if given.draws else 0.0)
+    controller = HandController(model, task.model_copy(update={"start": above}), draws=given.draws)
     goal = task.goal.model_copy(update={"position_m": PLACES[scene.stem.removeprefix("env_allegro_")][1]})
     controller.task = task.model_copy(update={"goal": goal})
     controller.hand = replace(controller.hand, task=controller.task)
-    found = run_hand(controller, HandScenePlant(controller.hand), seed, "ideal")
+    with no_garbage_search():
+        found = run_hand(controller, HandScenePlant(controller.hand), seed, "ideal")
     cpu = 1e3 * found.column("cpu_s", "plans")
     return {
         "ended": found.ended,
@@ -182,6 +186,7 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=0.01)
     parser.add_argument("--speed", type=float, default=2.0, help="limit of targets [rad/s]; theirs: 0.2 rad a command")
     parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
+    parser.add_argument("--draws", type=int, default=0, help="of friction, whose standard error is 70 %% then")
     parser.add_argument("--lift", type=float, default=0.0, help="height above the start of the repository [m]")
     parser.add_argument("--store", type=Path, default=None)
     parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
@@ -200,6 +205,7 @@ def main() -> None:
             for seed in range(given.first, given.first + given.seeds):
                 size = f"{given.hz:g} Hz, {given.samples} x {given.horizon:g} s in steps of {1e3 * given.step:g} ms"
                 size += f", {given.plant}" if given.plant else ""
+                size += f", {given.draws} draws" if given.draws else ""
                 store.result(f"{thing}, {size}/{seed}", lambda c=scene, s=seed: measure(folder, c, s, given))
 
 

@@ -17,7 +17,6 @@ a real clock on some cores of a machine: `taskset -c`, one process each.
 from __future__ import annotations
 
 import argparse
-import gc
 import math
 import os
 import shutil
@@ -38,9 +37,10 @@ from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
 from cgwm.pipeline.control.horizon import Array
 from cgwm.pipeline.control.solvers import Solution
+from cgwm.pipeline.runtime.resources import no_garbage_search
 from cgwm.schemas import ContactParameters, HandTask, NotConvergedError
 from hand_cem import CemController
-from known_object import errors_of, known_object
+from known_object import SPREAD, errors_of, known_object, sensing_of
 from numpy.typing import ArrayLike
 from processor_clock import charge_processors
 from store import Store, timed
@@ -57,13 +57,13 @@ Note = Callable[[dict[str, Any]], object]
 PLACE_M, ROOT_WXYZ = (0.0, 0.03, 0.1), (0.0, 0.9961947, 0.0, -0.0871557)
 
 
-def cube() -> Model:
-    """Return the model of the cube, with the numbers of the scene."""
+def cube(spread: float = 0.0) -> Model:
+    """Return the model of the cube, with the numbers of the scene, and a relative standard error of its friction."""
     inner = HALF_M - ROUNDING_M
     corners = np.array([(x, y, z) for x in (-inner, inner) for y in (-inner, inner) for z in (-inner, inner)])
     contact = ContactParameters(friction=FRICTION, contact_time_s=0.004, damping_ratio=1.0)
     inertia = MASS_KG * 2 / 3 * HALF_M**2 * np.eye(3)
-    return known_object((corners, np.full(8, ROUNDING_M)), MASS_KG, inertia, np.zeros(3), contact)
+    return known_object((corners, np.full(8, ROUNDING_M)), MASS_KG, inertia, np.zeros(3), contact, spread)
 
 
 def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
@@ -110,6 +110,7 @@ def task_in(folder: Path, scene: Path, given: argparse.Namespace) -> HandTask:
                 "horizon_s": given.horizon,
                 "step_s": given.step,
             },
+            "sensing": sensing_of(given.plant),
             "success": {"turn_deg": math.degrees(0.4), "drop_m": 0.4, "goals": 20, "timeout_s": given.seconds},
             "plant": {"kind": "mujoco", "scene": "xml/leap_cube_sim.xml", "body": "cube", **errors_of(given.plant)},
         }
@@ -171,21 +172,21 @@ def measure(
 ) -> dict[str, Any]:
     """Return the figures of one run."""
     clock, device = given.clock, given.device
-    model = cube() if given.model is None else read_model(given.model)
+    model = cube(SPREAD if given.draws else 0.0) if given.model is None else read_model(given.model)
     if name == "cem":
         controller = CemController(model, task)
     else:
         solver = "mppi" if name == "hold" else name
-        controller = HandController(model, task, solver, device=device)  # pyright: ignore[reportArgumentType]
+        extra: Any = {"draws": given.draws, "device": device}
+        controller = HandController(model, task, solver, **extra)  # pyright: ignore[reportArgumentType]
     if name == "hold":
         controller._solver = Hold()
     if clock == "cpu":
         charge_processors(controller)
     before = os.getloadavg()[0]
     plant = Limited(HandScenePlant(controller.hand), controller, end_s, note)
-    gc.collect()
-    gc.freeze()  # what is there before the run is never garbage: no plan waits for its being looked at
-    found = run_hand(controller, plant, seed, "ideal" if clock == "ideal" else "real")
+    with no_garbage_search():
+        found = run_hand(controller, plant, seed, "ideal" if clock == "ideal" else "real")
     wall, cpu = (1e3 * found.column(key, "plans") for key in ("wall_s", "cpu_s"))
     reached = found.column("reached")
     return {
@@ -246,6 +247,7 @@ def main() -> None:
     parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
     parser.add_argument("--model", type=Path, default=None, help="a fitted model of the cube in place of the true one")
     parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
+    parser.add_argument("--draws", type=int, default=0, help="of friction, whose standard error is 70 %% then")
     parser.add_argument("--limit", type=float, default=math.inf, help="wall time after which runs are cut [s]")
     given = parser.parse_args()
     end_s = time.monotonic() + given.limit
@@ -267,6 +269,7 @@ def main() -> None:
                     return
                 kind = f"{given.device}, {given.plant}" if given.plant else given.device
                 kind += "" if given.model is None else ", fitted"
+                kind += f", {given.draws} draws" if given.draws else ""
                 key = f"{name}, {given.clock}, {given.hz:g} Hz, {size}, {kind}/{seed}"
                 known = store.known(key)
                 if known is None or known["ended"] == UNFINISHED:

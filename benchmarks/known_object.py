@@ -6,12 +6,13 @@ import numpy as np
 from cgwm.datasets.models.model import Model
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.pipeline.control.horizon import Array
-from cgwm.schemas import BodyModel, ContactParameters, ModelFile, Pose, Provenance
+from cgwm.schemas import BodyModel, ContactParameters, FittedParameter, ModelFile, Pose, Provenance
 
 
 def known_object(
-    balls: tuple[Array, Array], mass_kg: float, inertia_kg_m2: Array, com_m: Array, contact: ContactParameters
-) -> Model:
+    balls: tuple[Array, Array], mass_kg: float, inertia_kg_m2: Array, com_m: Array, contact: ContactParameters,
+    friction_spread: float = 0.0,
+) -> Model:  # fmt: skip
     """Return the model of an object, whose body has the name `object`.
 
     Args:
@@ -20,6 +21,7 @@ def known_object(
         inertia_kg_m2: Inertia about the centre of mass, in its frame, shape (3, 3) [kg m2].
         com_m: Centre of mass, shape (3,) [m].
         contact: Numbers of the contact.
+        friction_spread: Relative standard error of the friction, under which draws of the model are made; 0 for none.
     """
     centers, radii = balls
     xx, yy, zz, xy, xz, yz = (float(inertia_kg_m2[k]) for k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
@@ -33,9 +35,24 @@ def known_object(
         photo_pose=Pose(position_m=(0.0, 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
         convex=True,
     )
-    file = ModelFile(bodies=(body,), contact=contact, provenance=Provenance(capture="none"))
+    friction = contact.friction
+    unsure = FittedParameter(
+        name="friction", unit="1", estimate=friction, std_error=friction_spread * friction,
+        bounds=(0.1 * friction, 10 * friction),
+    )  # fmt: skip
+    parameters = (unsure,) if friction_spread else ()
+    file = ModelFile(bodies=(body,), contact=contact, parameters=parameters, provenance=Provenance(capture="none"))
     spheres = Splats(centers, radii / 2, np.full(len(radii), 0.95), np.full((len(radii), 3), 0.5))
     return Model(root=None, file=file, collision={"object": spheres})
+
+
+SPREAD = 0.7
+"""Relative standard error of friction in draws: log-normal, so that half and twice the friction are one of it away."""
+
+
+def sensing_of(words: str) -> dict[str, float]:
+    """Return what a controller is told of the states of a plant whose errors `errors_of` reads."""
+    return {name: value for name, value in errors_of(words).items() if name.startswith("noise")}
 
 
 def errors_of(words: str) -> dict[str, float]:

@@ -141,8 +141,8 @@ class PlannerSection(TaskSection):
     """Sequences of commands that are compared for a plan."""
     step_s: Step = 0.01
     """Largest time step of a prediction [s]."""
-    risk: Literal["mean", "worst_quarter"] = "mean"
-    """What counts of the costs under several draws of the model (--draws)."""
+    risk: Literal["likely", "mean", "worst_quarter"] = "mean"
+    """What counts of the costs under several draws of the model (--draws): their mean, or that of the worst quarter."""
     bad_states: Annotated[int, Field(ge=1, le=1_000_000)] = 30
     """States in a row that are missing, stale or no numbers, after which a run stops."""
 
@@ -230,9 +230,11 @@ class ControlTask(TaskSection):
         return Path(self._source).parent if self._source != "the task" else Path()
 
     @model_validator(mode="after")
-    def _true_shape(self) -> ControlTask:
+    def _complete(self) -> ControlTask:
         if self.plant.kind == "mujoco" and not self.plant.meshes:
             raise ValueError('plant.kind = "mujoco" needs plant.meshes, the convex parts of the object\'s true mesh')
+        if self.planner.risk == "likely":
+            raise ValueError('planner.risk = "likely" is for hands; a push has "mean" or "worst_quarter"')
         if self.start.turn_deg[1] < self.start.turn_deg[0]:
             raise ValueError(f"start.turn_deg is a range [low, high]; found {list(self.start.turn_deg)}")
         return self

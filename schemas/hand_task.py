@@ -130,6 +130,19 @@ class HandPlannerSection(PlannerSection):
     """Sequences of commands that are compared for a plan; plans that come in time matter more than their number."""
     step_s: Step = 0.01
     """Largest time step of a prediction [s]; contacts are softened to it."""
+    risk: Literal["likely", "mean", "worst_quarter"] = "likely"
+    """What counts of several draws of the model (--draws): the draw whose predictions of the motion seen until now were
+    best; or the mean of the costs under all, or of the worst quarter, which multiplies the time of a plan.
+    """
+
+
+class HandSensingSection(TaskSection):
+    """What the controller knows of measured states; their age is the difference of their times and that of commands."""
+
+    noise_m: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Standard deviation of the measured position, per coordinate [m]; above 0 positions are filtered."""
+    noise_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
+    """Standard deviation of the measured rotation, per coordinate [deg]; above 0 rotations are filtered."""
 
 
 class HandSuccessSection(TaskSection):
@@ -187,6 +200,7 @@ class HandTask(TaskSection):
     start: HandStartSection = HandStartSection()
     costs: HandCostsSection = HandCostsSection()
     planner: HandPlannerSection = HandPlannerSection()
+    sensing: HandSensingSection = HandSensingSection()
     success: HandSuccessSection = HandSuccessSection()
     plant: HandPlantSection = HandPlantSection()
     _source: str = PrivateAttr("the task")

@@ -121,7 +121,11 @@ def drawn_worlds(model: Model, draws: int, seed: int, device: str, planned: Call
         return Worlds(batch=lambda rows: one, draws=1)
     rng = np.random.default_rng([seed, 2])
     file = with_correlations(model)
-    worlds = [planned(replace(model, file=draw_parameters(file, 1.0, rng)[0])) for _ in range(draws)]
+    names = [parameter.name for parameter in file.parameters]
+    # one quantile of each parameter in each of K equal parts, as few draws should cover what is possible
+    parts = (rng.permuted(np.tile(np.arange(draws), (len(names), 1)), axis=1) + rng.random((len(names), draws))) / draws
+    drawn = [draw_parameters(file, 1.0, rng, quantiles=dict(zip(names, part, strict=True)))[0] for part in parts.T]
+    worlds = [planned(replace(model, file=one)) for one in drawn]
 
     @lru_cache(_BATCHES)
     def batch(rows: tuple[int, ...]) -> World:

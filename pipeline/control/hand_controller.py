@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +17,10 @@ from ..runtime.device import resolve_device
 from .controller import drawn_worlds
 from .elites import Elites
 from .hand_objective import HandObjective
+from .hand_tracker import LONGEST_S, STEP_S, HandTracker
 from .hand_world import HandWorld, hand_world, world_of
 from .horizon import Targets
+from .objective import Worlds
 from .planning import ControlState, PlanningController
 from .solvers import solver_of
 
@@ -58,13 +62,22 @@ class HandController(PlanningController):
         self.goal_wxyz = np.array(task.start.quat_wxyz)
         where, found = str(resolve_device(device)), self.hand
 
-        def planned(drawn: Model | None) -> World:
-            return found.planning(
-                None if drawn is None else world_of(drawn, task, found.chain, found.world.bodies[:-1])
-            )
+        def planned(drawn: Model | None, step_s: float = task.planner.step_s) -> World:
+            if drawn is None:
+                return found.planning(step_s=step_s)
+            factor = _friction(drawn) / _friction(model)
+            return found.planning(world_of(drawn, task, found.chain, found.world.bodies[:-1], factor), step_s)
 
         worlds = drawn_worlds(model, draws, seed, where, planned)
+        tracked = partial(planned, step_s=min(STEP_S, task.planner.step_s))
+        self._tracker = HandTracker(found, drawn_worlds(model, draws, seed, "cpu", tracked))
         super().__init__(task.planner, worlds, solver_of(solver, Elites(task.planner.samples)), where, seed)
+
+    def restart(self, seed: int) -> None:
+        """See :class:`PlanningController`."""
+        super().restart(seed)
+        self._tracker.restart(seed)
+        self._tracked_s = -math.inf
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -87,6 +100,22 @@ class HandController(PlanningController):
             raise UsageError(f"a goal of {np.asarray(goal_wxyz).tolist()}.", "w, x, y, z of an orientation.")
         self.goal_wxyz = goal / np.linalg.norm(goal)
 
+    def _sent_since(self, state: ControlState) -> Targets | None:
+        """Return the targets of the joints since the last state that was tracked; None where they are unknown."""
+        since, self._tracked_s = self._tracked_s, state.time_s
+        if not self._sent or not since < state.time_s:
+            return None
+        # before the first command, and after the last one, the targets stay
+        held = Targets(times_s=np.array([0.0]), values_m=self._sent[-1][1][None])
+        return self._given(held, max(since, state.time_s - LONGEST_S), state.time_s)
+
+    def _planned_in(self) -> Worlds:
+        """Return the worlds that plans are evaluated in: those of all draws, or that which agreed best."""
+        if self._worlds.draws == 1 or self.task.planner.risk != "likely":
+            return self._worlds
+        likely = self._worlds.batch((self._tracker.draw,))
+        return Worlds(batch=lambda rows: likely, draws=1)
+
     def _objective(self, state: ControlState, acts_s: float) -> tuple[HandObjective, Tensor]:
         """Return the objective of a plan, and the plan before over its knots, shape (N, joints)."""
         planner, hand = self.task.planner, self.hand
@@ -94,22 +123,21 @@ class HandController(PlanningController):
         before = (
             self._plan.targets if self._plan else Targets(times_s=np.array([state.time_s]), values_m=measured[None])
         )
-        lead = [state.time_s, acts_s] if acts_s > state.time_s + 1e-9 else [state.time_s]
+        believed = self._tracker.update(state, self._sent_since(state))
+        lead = self._given(before, state.time_s, acts_s)
         knots = acts_s + planner.horizon_s / planner.knots * np.arange(1, planner.knots + 1)
-        zero = np.zeros(3)
         objective = HandObjective(
             hand=hand,
-            worlds=self._worlds,
-            state=hand.state(
-                state.position_m,
-                np.asarray(state.quat_wxyz, float) / np.linalg.norm(state.quat_wxyz),
-                dict(state.joints),
-                zero if state.velocity_m_s is None else state.velocity_m_s,
-                zero if state.omega_body_rad_s is None else state.omega_body_rad_s,
-                dict(state.joint_speeds or {}),
-            ),
+            worlds=self._planned_in(),
+            state=believed,
             goal_wxyz=self.goal_wxyz,
-            times_s=np.array([*lead, *knots]),
-            given_rad=before.at(np.array(lead)),
+            times_s=np.array([*lead.times_s, *knots]),
+            given_rad=lead.values_m,
         )
         return objective, objective.values_of(before)
+
+
+def _friction(model: Model) -> float:
+    contact = model.file.contact
+    assert contact is not None  # a model without is refused
+    return contact.friction

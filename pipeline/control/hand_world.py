@@ -69,13 +69,14 @@ class HandWorld:
         """Larger distance of each joint's limits from its value at the start [rad], shape (joints,)."""
         return np.maximum(self.upper - self.home, self.home - self.lower)
 
-    def planning(self, world: World | None = None) -> World:
-        """Return a world for predictions in the steps of the planner, whose contacts are soft enough for these steps.
+    def planning(self, world: World | None = None, step_s: float | None = None) -> World:
+        """Return a world for predictions, whose contacts are soft enough for their steps.
 
         Args:
             world: A world with other parameters; None for that of the model.
+            step_s: The steps [s]; None for those of the planner.
         """
-        return softened(world or self.world, self.task.planner.step_s)
+        return softened(world or self.world, step_s or self.task.planner.step_s)
 
     def state(
         self,
@@ -272,7 +273,7 @@ def _with_few_corners(body: Body, corners: int) -> Body:
     return _with_hull(body, rounded_hull(surface.reshape(-1, 3), corners))
 
 
-def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body]) -> World:
+def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body], friction_factor: float = 1.0) -> World:
     """Return the world of hand and object, with the law of the model and the frictions that the task gives.
 
     Args:
@@ -280,6 +281,8 @@ def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body]) 
         task: The task.
         chain: The hand.
         links: Its links.
+        friction_factor: Factor of the frictions of links that the task gives: by how much the object's surface is more
+            slippery or less than its model says.
 
     Raises:
         InputDataError: If the model has another contact law than that of cgwm.
@@ -290,7 +293,7 @@ def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body]) 
     if not isinstance(law, ContactLaw):
         raise InputDataError(f"{model.place}: the model has the contact law of a paper.", "that of cgwm.", "fit again.")
     laws = {
-        pair_of(OBJECT, f"{LINK} {link}"): replace(law, friction=torch.full_like(law.friction, value))
+        pair_of(OBJECT, f"{LINK} {link}"): replace(law, friction=torch.full_like(law.friction, friction_factor * value))
         for link, value in task.robot.friction.items()
     }
     return World(

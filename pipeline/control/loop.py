@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -71,6 +71,9 @@ class Measured(Protocol):
 class Sensor:
     """Measured states of a plant: late by a constant delay, with noise.
 
+    A state between two commands lies on the way between theirs; before the start the plant was at rest. Where poses are
+    noisy there are no velocities: differences of such poses say nothing about them.
+
     Args:
         plant: The section of the task that has delay and noise.
         interval_s: Length of a command [s].
@@ -78,19 +81,32 @@ class Sensor:
     """
 
     def __init__(self, plant: PlantSection | HandPlantSection, interval_s: float, seed: int) -> None:
-        self._late = round(plant.delay_s / interval_s)
+        self._late_s = plant.delay_s
         self._noise = plant.noise_m, math.radians(plant.noise_deg)
         self._rng = np.random.default_rng([seed, 3])
-        self._states: deque[ControlState] = deque(maxlen=self._late + 1)
+        self._states: deque[ControlState] = deque(maxlen=math.ceil(plant.delay_s / interval_s - 1e-9) + 1)
 
     def seen(self, time_s: float, truth: Measured) -> ControlState:
-        """Return the newest state that has arrived at a time [s]; at the start the first one."""
-        place, turn = self._noise
-        quat = torch.as_tensor(truth.quat_wxyz)
-        shaken = quat_multiply(quat, quat_exp(torch.as_tensor(self._rng.normal(0.0, 1.0, 3) * turn)))
-        position = truth.position_m + self._rng.normal(0.0, 1.0, 3) * place
-        self._states.append(truth.measured(time_s, position, shaken.numpy() if turn else truth.quat_wxyz))
-        return self._states[0]
+        """Return the newest state that has arrived at a time [s]."""
+        self._states.append(truth.measured(time_s, truth.position_m, truth.quat_wxyz))
+        state, (place, turn) = self._at(time_s - self._late_s), self._noise
+        if not place and not turn:
+            return state
+        wrong = quat_exp(torch.as_tensor(self._rng.normal(0.0, 1.0, 3) * turn))
+        return replace(
+            state,
+            position_m=state.position_m + self._rng.normal(0.0, 1.0, 3) * place,
+            quat_wxyz=quat_multiply(torch.as_tensor(state.quat_wxyz), wrong).numpy(),
+            velocity_m_s=None,
+            omega_body_rad_s=None,
+        )
+
+    def _at(self, time_s: float) -> ControlState:
+        """Return the state at a time [s]."""
+        first, second = self._states[0], self._states[min(1, len(self._states) - 1)]
+        if time_s <= first.time_s + 1e-9 or first is second:
+            return replace(first, time_s=time_s)
+        return first.towards(second, (time_s - first.time_s) / (second.time_s - first.time_s))
 
 
 def run(controller: Controller, plant: Plant, seed: int, clock: ClockName) -> Recording:
@@ -152,11 +168,14 @@ class Commander:
     ) -> None:
         self._controller, self._clock, self._recording, self._knots = controller, clock, recording, knots
         self._command = dict(zip(controller.joints, map(float, first), strict=True))
-        self._waiting, self._acting = Waiting(controller.interval_s, clock), None
+        self._waiting, self._acting, self._begun = Waiting(controller.interval_s, clock), None, False
 
     def command(self, now_s: float, state: ControlState) -> dict[str, float] | None:
         """Return the targets at the end of the command that begins now; None after too many bad states."""
         controller, interval = self._controller, self._controller.interval_s
+        if not self._begun:
+            controller.note_sent(now_s, self._command)
+        self._begun = True
         self._acting = self._waiting.arrived(now_s) or self._acting
         if self._waiting.free:
             plan = controller.plan(state, now_s + self._waiting.expected_s)
@@ -169,6 +188,7 @@ class Commander:
             return None
         if self._acting is not None:
             self._command = controller.limited(self._command, self._acting.targets.at(now_s + interval))
+        controller.note_sent(now_s + interval, self._command)
         return self._command
 
     def finish(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,12 +14,15 @@ import torch
 from torch import Tensor
 
 from ...schemas import JOINTS, NotConvergedError, PlannerSection, UsageError
+from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
 from ..physics.fused.host import lacking
 from ..runtime.resources import one_torch_thread
 from .horizon import Array, Forecast, Targets
 from .objective import PlanObjective, Worlds
 from .solvers import Solver
 
+SENT = 512
+"""Commands that are kept, from which late states are predicted forward."""
 UNIT_TOLERANCE = 0.01
 """Largest deviation of a measured quaternion's length from 1."""
 
@@ -41,6 +45,32 @@ class ControlState:
     """Angular velocity, body frame [rad/s], shape (3,); None: at rest."""
     joint_speeds: Mapping[str, float] | None = None
     """Speed of each joint by name [m/s, of hinges rad/s]; None: at rest. A finger without servos has none."""
+
+    def towards(self, other: ControlState, share: float) -> ControlState:
+        """Return a state on the way to a later one, at a share of the time between both, from 0 to 1."""
+
+        def mean(first: Array, second: Array) -> Array:
+            return (1 - share) * first + share * second
+
+        def means(first: Mapping[str, float] | None, second: Mapping[str, float] | None) -> dict[str, float] | None:
+            if first is None or second is None:
+                return None
+            return {name: (1 - share) * value + share * second[name] for name, value in first.items()}
+
+        def mean_or_none(first: Array | None, second: Array | None) -> Array | None:
+            return None if first is None or second is None else mean(first, second)
+
+        first, second = torch.as_tensor(self.quat_wxyz), torch.as_tensor(other.quat_wxyz)
+        turn = quat_log(quat_multiply(quat_conjugate(first), second * torch.sign((first * second).sum())))
+        return ControlState(
+            time_s=(1 - share) * self.time_s + share * other.time_s,
+            joints=means(self.joints, other.joints) or {},
+            position_m=mean(self.position_m, other.position_m),
+            quat_wxyz=quat_multiply(first, quat_exp(share * turn)).numpy(),
+            velocity_m_s=mean_or_none(self.velocity_m_s, other.velocity_m_s),
+            omega_body_rad_s=mean_or_none(self.omega_body_rad_s, other.omega_body_rad_s),
+            joint_speeds=means(self.joint_speeds, other.joint_speeds),
+        )
 
     def fault(self, joints: Sequence[str] = JOINTS) -> str:
         """Return what is wrong with the numbers of the state, in words; empty for nothing.
@@ -121,6 +151,7 @@ class PlanningController(ABC):
         self._plan: ControlPlan | None = None
         self._found: tuple[PlanObjective, Tensor] | None = None
         self._command: dict[str, float] = {}
+        self._sent: deque[tuple[float, Array]] = deque(maxlen=SENT)
         self._last_s, self._bad, self.held = -math.inf, 0, 0
 
     @property
@@ -134,7 +165,29 @@ class PlanningController(ABC):
         world = self._worlds.batch((0,) if self._worlds.draws > 1 else ())
         return "" if self._device != "cpu" else lacking(world) or ""
 
-    def command(self, state: ControlState | None) -> dict[str, float]:
+    def note_sent(self, time_s: float, command: Mapping[str, float]) -> None:
+        """Note the targets that the joints have at a time [s], by joint name; times increase."""
+        self._sent.append((time_s, np.array([command[name] for name in self.joints])))
+
+    def _given(self, before: Targets, state_s: float, acts_s: float) -> Targets:
+        """Return the targets from the time of a state to that of acting [s]: what was sent, then a plan.
+
+        Args:
+            before: The plan before.
+            state_s: Time of the state.
+            acts_s: Time from which the next plan acts.
+        """
+        sent = [(time, target) for time, target in self._sent if time < acts_s + 1e-9]
+        if not sent:
+            times = np.array([state_s, acts_s] if acts_s > state_s + 1e-9 else [state_s])
+            return Targets(times_s=times, values_m=before.at(times))
+        known = Targets(times_s=np.array([time for time, _ in sent]), values_m=np.stack([each for _, each in sent]))
+        inner = [time for time, _ in sent if state_s + 1e-9 < time < acts_s - 1e-9]
+        times = np.array([state_s, *inner, acts_s] if acts_s > state_s + 1e-9 else [state_s])
+        later = times > known.times_s[-1] + 1e-9
+        return Targets(times_s=times, values_m=np.where(later[:, None], before.at(times), known.at(times)))
+
+    def command(self, state: ControlState | None, now_s: float | None = None) -> dict[str, float]:
         """Return the targets of the joints at the end of the next command's interval, by joint name [m, rad].
 
         A state that is missing, stale or no numbers holds the last command, and is counted in `held`. Before the first
@@ -142,11 +195,13 @@ class PlanningController(ABC):
 
         Args:
             state: The measured state; None where there is none.
+            now_s: Time from which the command acts [s]; by default that of the state. A state that is older is
+                predicted forward to it.
 
         Raises:
             NotConvergedError: If `bad_states` states in a row were bad; the robot should stop.
         """
-        plan = self.plan(state)
+        plan = self.plan(state, now_s)
         if self.lost:
             raise NotConvergedError(
                 f"{self._bad} states in a row are missing, stale or no numbers.",
@@ -156,6 +211,9 @@ class PlanningController(ABC):
             return dict(self._command)
         before = self._command or (state.joints if state is not None else {})
         self._command = self.limited(before, plan.targets.at(plan.acts_s + self.interval_s))
+        if not self._sent:
+            self.note_sent(plan.acts_s, before)
+        self.note_sent(plan.acts_s + self.interval_s, self._command)
         return dict(self._command)
 
     def limited(self, before: Mapping[str, float], wanted: Array) -> dict[str, float]:

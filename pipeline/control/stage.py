@@ -34,6 +34,7 @@ from ...schemas import (
 )
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
+from ..runtime.resources import no_garbage_search
 from .page import FILM, PAGE, PageRun, control_html
 from .runner import Runner, planning_world, runner_of
 from .tables import figures_of
@@ -191,7 +192,8 @@ def _run(runner: Runner, seed: int, clock: ClockName, checkpoint: Checkpoint) ->
     kept = slot.read(torch.device("cpu"))
     if kept is None:
         note(f"control: seed {seed}")
-        recording = runner.run(seed, clock)
+        with no_garbage_search():
+            recording = runner.run(seed, clock)
         tables = runner.tables(recording, clock == "real")
         figures = figures_of(recording, tables, runner.start_errors(seed), runner.controller.interval_s)
         arrays = {name: torch.as_tensor(values) for name, values in tables.arrays.items()}

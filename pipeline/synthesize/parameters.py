@@ -38,7 +38,11 @@ _UNITS = {"friction": "1", "contact_time_s": "s", "damping_ratio": "1", "ground_
 
 
 def draw_parameters(
-    file: ModelFile, spread: float, rng: np.random.Generator, replaced: Mapping[str, Distribution] | None = None
+    file: ModelFile,
+    spread: float,
+    rng: np.random.Generator,
+    replaced: Mapping[str, Distribution] | None = None,
+    quantiles: Mapping[str, float] | None = None,
 ) -> tuple[ModelFile, tuple[RolloutParameter, ...]]:
     """Draw the physical parameters of a rollout from their joint posterior in the fit.
 
@@ -52,12 +56,16 @@ def draw_parameters(
         spread: Factor of the standard errors.
         rng: Source of randomness; one number is drawn for each parameter, varied or not, then for `replaced`.
         replaced: Distributions of parameters by name, in place of the fit's.
+        quantiles: A quantile for each parameter, before those that were fitted together are correlated; None draws
+            them.
 
     Returns:
         The model with these parameters, and the parameters; derived ones (restitution, ...) are consistent with them.
     """
     replaced = replaced or {}
-    quantiles = _joint_quantiles(file, rng)
+    if quantiles is None:
+        quantiles = {parameter.name: float(rng.random()) for parameter in file.parameters}
+    quantiles = _joint_quantiles(file, quantiles)
     known = {parameter.name: parameter for parameter in file.parameters}
     values = {name: draw(replaced[name], rng) for name in sorted(replaced)}
     for name, parameter in known.items():
@@ -78,9 +86,9 @@ def draw_parameters(
     return drawn, tuple(entries)
 
 
-def _joint_quantiles(file: ModelFile, rng: np.random.Generator) -> dict[str, float]:
-    """Draw the quantile of each parameter within its own distribution, by the copula of those fitted together."""
-    quantiles = {parameter.name: float(rng.random()) for parameter in file.parameters}
+def _joint_quantiles(file: ModelFile, independent: Mapping[str, float]) -> dict[str, float]:
+    """Return the quantile of each parameter within its own distribution, by the copula of those fitted together."""
+    quantiles = {name: float(value) for name, value in independent.items()}
     for block in file.correlations:
         normal = _root(block) @ ndtri([quantiles[name] for name in block.parameters])
         quantiles |= dict(zip(block.parameters, map(float, ndtr(normal)), strict=True))

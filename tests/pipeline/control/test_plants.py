@@ -110,12 +110,15 @@ def test_the_ideal_clock_lets_a_plan_act_at_once() -> None:
 
 
 def test_measured_states_are_late_and_noisy_as_asked() -> None:
-    task = push_task(plant={"delay_s": 2 * DT, "noise_m": 0.003, "noise_deg": 3.0})
-    sensor = Sensor(task.plant, DT, 0)
     still = Truth(position_m=np.zeros(3), quat_wxyz=np.array([1.0, 0, 0, 0]), velocity_m_s=np.zeros(3),
                   omega_body_rad_s=np.zeros(3), finger_m=np.zeros(2), force_n=np.zeros(3))  # fmt: skip
+    late = Sensor(push_task(plant={"delay_s": 1.5 * DT}).plant, DT, 0)
+    seen = [late.seen(DT * k, replace(still, position_m=np.array([k, 0.0, 0.0]))) for k in range(4)]
+    assert [state.time_s for state in seen] == pytest.approx([-1.5 * DT, -0.5 * DT, 0.5 * DT, 1.5 * DT])
+    assert [state.position_m[0] for state in seen] == pytest.approx([0.0, 0.0, 0.5, 1.5])
+    sensor = Sensor(push_task(plant={"delay_s": 2 * DT, "noise_m": 0.003, "noise_deg": 3.0}).plant, DT, 0)
     seen = [sensor.seen(DT * k, still) for k in range(600)]
-    assert [state.time_s for state in seen[:4]] == [0.0, 0.0, 0.0, DT]
+    assert seen[5].velocity_m_s is None  # differences of noisy poses say nothing
     assert np.std([state.position_m for state in seen]) == pytest.approx(0.003, rel=0.1)
     turns = np.degrees([2 * state.quat_wxyz[1:] for state in seen])
     assert np.std(turns) == pytest.approx(3.0, rel=0.1)

@@ -1,0 +1,92 @@
+"""What the controller of a hand holds to be true, from late and noisy states and from several draws of the model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cgwm.datasets.models.model import Model
+from cgwm.pipeline.control.hand_controller import HandController
+from cgwm.pipeline.control.hand_loop import hand_start
+from cgwm.pipeline.control.hand_plant import HandModelPlant
+from cgwm.pipeline.control.horizon import Targets
+from cgwm.pipeline.control.loop import Sensor
+from cgwm.schemas import FittedParameter
+from helpers import fused_host
+from helpers.paddles import hand_task, write_hand
+from helpers.pushing import pushed_model
+
+pytestmark = [
+    pytest.mark.usefixtures("one_thread"),
+    pytest.mark.skipif(fused_host.COMPILER is None, reason="needs g++ to build the kernel for the CPU"),
+]
+NOISE = {"noise_m": 0.003, "noise_deg": 3.0}
+
+
+@pytest.fixture(scope="module")
+def unsure(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Model]:
+    """A folder with a hand, and a model whose friction is known to a factor of two."""
+    folder, model = tmp_path_factory.mktemp("hand"), pushed_model(visible=False)
+    write_hand(folder)
+    contact = model.file.contact
+    assert contact is not None
+    value = contact.friction
+    friction = FittedParameter(
+        name="friction", unit="1", estimate=value, std_error=0.7 * value, bounds=(0.1 * value, 10 * value)
+    )
+    return folder, replace(model, file=model.file.model_copy(update={"parameters": (friction,)}))
+
+
+def errors_while_pushing(controller: HandController, **plant: Any) -> np.ndarray:
+    """Return the errors (commands, 2) of place [m] and turn [rad] of the state that is held to be true."""
+    found = HandModelPlant(replace(controller.hand, task=controller.task.model_copy(
+        update={"plant": controller.task.plant.model_copy(update=plant)}
+    )))  # fmt: skip
+    truth, interval, errors = found.reset(*hand_start(controller.task, 0)), controller.interval_s, []
+    sensor = Sensor(controller.task.plant.model_copy(update=plant), interval, 0)
+    controller.restart(0)
+    controller.note_sent(0.0, dict(zip(controller.joints, controller.hand.home, strict=True)))
+    for number in range(24):
+        state = sensor.seen(number * interval, truth)
+        held = controller._tracker.update(state, controller._sent_since(state))
+        quat = held.quat_wxyz[0, -1].numpy()
+        turn = 2 * math.acos(min(1.0, abs(float(quat @ truth.quat_wxyz))))
+        errors.append((np.linalg.norm(held.position_m[0, -1].numpy() - truth.position_m), turn))
+        target = np.array([min(0.05 * (number + 1), 1.2), 0.0])
+        controller.note_sent((number + 1) * interval, dict(zip(controller.joints, target, strict=True)))
+        truth = found.advance(target, interval)
+    assert np.linalg.norm(truth.position_m - np.array(controller.task.start.position_m)) > 0.01  # it was pushed
+    return np.array(errors)
+
+
+def test_noisy_poses_are_filtered_while_the_object_is_pushed(unsure: tuple[Path, Model]) -> None:
+    controller = HandController(unsure[1], hand_task(unsure[0], sensing=NOISE))
+    errors = errors_while_pushing(controller, **NOISE)[6:]
+    raw = math.sqrt(3) * np.array([0.003, math.radians(3)])
+    assert (np.sqrt(np.square(errors).mean(0)) < 0.6 * raw).all()
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_the_draw_that_predicts_the_motion_is_planned_with(unsure: tuple[Path, Model], factor: float) -> None:
+    controller = HandController(unsure[1], hand_task(unsure[0]), draws=5)
+    errors = errors_while_pushing(controller, friction_factor=factor)
+    np.testing.assert_allclose(errors, 0.0, atol=1e-7)  # exact poses are believed
+    draws = controller._tracker._worlds.batch(tuple(range(5))).contact.friction.flatten()
+    estimate = float(controller.hand.world.contact.friction)
+    chosen = float(controller._planned_in().batch(()).contact.friction)
+    nearest = float(draws[(draws / estimate / factor).log().abs().argmin()])
+    assert chosen == pytest.approx(nearest)
+
+
+def test_late_states_are_predicted_by_what_was_sent(unsure: tuple[Path, Model]) -> None:
+    controller = HandController(unsure[1], hand_task(unsure[0]))
+    for time_s, target in ((0.0, 0.0), (0.1, 0.2), (0.2, 0.1)):
+        controller.note_sent(time_s, {"swing": target, "lift": 0.0})
+    later = Targets(times_s=np.array([0.2, 0.3]), values_m=np.array([[0.1, 0.0], [0.5, 0.0]]))
+    given = controller._given(later, 0.05, 0.25)
+    np.testing.assert_allclose(given.times_s, [0.05, 0.1, 0.2, 0.25])
+    np.testing.assert_allclose(given.values_m[:, 0], [0.1, 0.2, 0.1, 0.3])
