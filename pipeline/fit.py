@@ -38,6 +38,7 @@ from ..schemas import (
 )
 from .phys_geo.effects.requested_effects import with_effects
 from .phys_geo.images.video_checks import examine_videos
+from .phys_geo.material_pairs import require_known_pairs
 from .phys_geo.stage import fit_motion
 from .phys_geo.tracks.earlier_estimates import with_fitted_physics
 from .physics.effects.trust import is_trusted, keep_trust
@@ -161,7 +162,9 @@ def _fit_or_keep(
     refuse_output(out, "model", overwrite)
     checkpoint = Checkpoint.beside(out, made_of, resume, overwrite)
     moves = stage == "phys-geo" or (stage == "all" and _has_motion(opened, split))
-    # videos that identify nothing are reported before hours of work
+    # pairs that nobody gave, and videos that identify nothing, are reported before hours of work
+    if moves:
+        require_known_pairs(opened, split)
     warnings = [*opened.inconsistencies, *_video_warnings(request)] if moves else []
     model = _fitted_model(request, checkpoint, moves, warnings)
     provenance = provenance.model_copy(update={"input_sha256": _with_sources(provenance, model.file.effects)})

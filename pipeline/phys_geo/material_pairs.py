@@ -40,12 +40,12 @@ class TouchingBodies:
 
 
 def touching_bodies(manifest: CaptureManifest) -> Iterator[TouchingBodies]:
-    """Yield the bodies that can touch: each free one with the ground, every surface, and every other body."""
+    """Yield the bodies that can touch: each free one and link with the ground, every surface, and every other body."""
     bodies, ground = manifest.bodies, manifest.world.ground
     for index, body in enumerate(bodies):
         if body.motion in MOVED and ground is not None:
             yield TouchingBodies((body.name,), _pair(body.material, ground.material))
-        for surface in manifest.surfaces if body.motion == "free" else ():
+        for surface in manifest.surfaces if body.motion in MOVED else ():
             yield TouchingBodies((body.name,), _pair(body.material, surface.material), surface.name)
         for other in bodies[index + 1 :]:
             if body.motion in MOVED or other.motion in MOVED:

@@ -39,7 +39,7 @@ from ..segments.described_motion import not_described
 from ..trajectories.frame_times import with_regular_times
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
-from .material_pairs import require_known_pairs, start_laws, with_pusher_law
+from .material_pairs import start_laws, with_pusher_law
 from .paper_setting import paper_config
 from .surface_starts import require_outside
 from .tracks.contact_result import PhysicsFit
@@ -72,7 +72,6 @@ def fit_motion(
         NotConvergedError: If the fit diverges.
     """
     _require_fittable(model, capture, config)
-    require_known_pairs(capture, split)
     if config.contact_law == "closed_form":
         capture = replace(capture, manifest=with_pusher_law(capture.manifest))
     else:

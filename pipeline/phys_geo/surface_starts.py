@@ -16,7 +16,7 @@ from ..physics.world import World
 
 
 def require_outside(world: World, capture: Capture, split: str) -> None:
-    """Refuse episodes of a split in which a free body begins deep inside a fixed surface.
+    """Refuse episodes of a split in which a free body or a link begins deep inside a fixed surface.
 
     Raises:
         InputDataError: With the deepest one: episode, body, surface and depth.
@@ -24,8 +24,9 @@ def require_outside(world: World, capture: Capture, split: str) -> None:
     found = [
         (*_deepest(world, index, track), name, world.bodies[index].name)
         for name in (capture.episodes(split) if world.surfaces else ())
-        for index in world.free
-        if (track := capture.tracks(name).get(world.bodies[index].name)) is not None
+        for index in world.tracked
+        if world.bodies[index].radii.shape[-1]
+        and (track := capture.tracks(name).get(world.bodies[index].name)) is not None
     ]
     excess, depth, allowed, surface, episode, body = max(found, default=(0.0, 0.0, 0.0, "", "", ""))
     if excess > 1:

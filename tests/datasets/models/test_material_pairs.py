@@ -104,6 +104,8 @@ def test_pairs_of_bodies_and_surfaces() -> None:
     laws = start_laws(model(pairs=(), contact=None, parameters=()).file, manifest)
     assert laws.contact.friction == 0.03 and laws.medians == {"friction": 0.03}  # the only pair in use
     assert [str(one) for one in touching_bodies(manifest)] == ["'cube' and surface 'sheet'"]
+    linked = manifest.model_copy(update={"bodies": (steel.model_copy(update={"motion": "link"}),)})
+    assert [str(one) for one in touching_bodies(linked)] == ["'cube' and surface 'sheet'"]
 
 
 def test_what_contradicts_itself_is_refused() -> None:
