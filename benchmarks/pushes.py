@@ -4,9 +4,10 @@ The end pose of each push is predicted from its measured start and the finger's 
 limit surface (an ellipsoid) are fitted to the same halves by the same robust least squares, from the best of a grid on:
 both with the friction of the finger, the engine with the finger's height and, on a patch, face_exponent, the ellipsoid
 with a scale of its radius. Errors are medians over the other halves, with the share of bootstrap draws (pushes, by
-file) in which the engine is not ahead. Then the friction of each ground by the measured forces of the fitted halves.
+file) in which the engine is not ahead; then the same for all pushes, each half predicted by fits to the other. Then the
+friction of each ground by the measured forces of the halves that are fitted first.
 
-    python benchmarks/pushes.py FOLDER [--out FILE]
+    python benchmarks/pushes.py FOLDER [--out FILE] [--workers N]
 
 FOLDER holds one folder for each file, named by the three supports as x1_x2_x3_y1_y2_y3 [mm] or `patch`, those on
 plywood with `wood_` before it.
@@ -16,11 +17,15 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from cgwm.datasets.importers.pushes import Push, read_pushes
 from numpy.typing import NDArray
 from push_models import (
@@ -175,48 +180,63 @@ def compared(files: list[dict[str, Array]]) -> dict[str, Any]:
     }
 
 
-def predicted(train: Pushes, test: Pushes) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return the errors (n, 2) of the test half by model, and the settings of each model."""
+@dataclass(frozen=True)
+class Half:
+    """What fits to one half of a file predict of the other."""
+
+    name: str
+    """Folder of the file."""
+    errors: dict[str, Array]
+    """Errors (n, 2) of the predicted half by model."""
+    settings: dict[str, Array]
+    """What was fitted, by model."""
+    ratios: Array
+    """Friction of the ground (n,) by the forces of each fitted push."""
+
+
+def predicted(pushes: Pushes, fitted_first: int) -> Half:
+    """Fit every second push of a file, from the first or the second one on, and predict the others."""
+    torch.set_num_threads(1)
+    train, test = (pushes.at(slice(first, None, 2)) for first in (fitted_first, 1 - fitted_first))
     found, settings = {"frozen": errors(test.start, test)}, {}
     for model in (ELLIPSOID, CGWM):
         settings[model.name] = fitted(model, train)
         found[model.name] = errors(model.ends(test, settings[model.name][None], faster=1.0)[0], test)
-    return found, settings
+    return Half(pushes.name, found, settings, force_ratio(train, settings["cgwm"]))
+
+
+def rows_of(halves: list[Half], swapped: list[Half]) -> Iterator[dict[str, Any]]:
+    """Yield one row for each file, one for all, the same with each half predicted by the other, one for each ground."""
+    for half in halves:
+        fits = {f"{name}_settings": values.round(4).tolist() for name, values in half.settings.items()}
+        forces = round(float(np.median(half.ratios)), 3)
+        yield {"file": half.name, **compared([half.errors]), **fits, "friction_by_forces": forces}
+    yield {"file": "all", **compared([half.errors for half in halves])}
+    both = [
+        {name: np.concatenate([first.errors[name], second.errors[name]]) for name in first.errors}
+        for first, second in zip(halves, swapped, strict=True)
+    ]
+    for half, each in zip(halves, both, strict=True):
+        yield {"file": half.name, "halves": "both", **compared([each])}
+    yield {"file": "all", "halves": "both", **compared(both)}
+    yield from friction_by_ground({half.name: half.ratios for half in halves})
 
 
 def main() -> None:
-    """Print one row for each file, one for all and one for each ground."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Print the rows, and write them where asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, help="file to which the rows are written")
+    parser.add_argument("--workers", type=int, default=1, help="processes, each fits half a file at a time")
     arguments = parser.parse_args()
-    rows: list[dict[str, Any]] = []
-    found, ratios = [], {}
-
-    def add(row: dict[str, Any]) -> None:
-        rows.append(row)
-        print(json.dumps(row), flush=True)
-
-    for pushes in read(arguments.folder):
-        train, test = (pushes.at(slice(first, None, 2)) for first in (0, 1))
-        each, settings = predicted(train, test)
-        found.append(each)
-        ratios[pushes.name] = force_ratio(train, settings["cgwm"])
-        medians = compared([each])
-        fits = {f"{name}_settings": values.round(4).tolist() for name, values in settings.items()}
-        add(
-            {
-                "file": pushes.name,
-                **medians,
-                **fits,
-                "friction_by_forces": round(float(np.median(ratios[pushes.name])), 3),
-            }
-        )
-    add({"file": "all", **compared(found)})
-    for row in friction_by_ground(ratios):
-        add(row)
+    files = read(arguments.folder)
+    with ProcessPoolExecutor(arguments.workers) as pool:
+        asked = [[pool.submit(predicted, pushes, first) for pushes in files] for first in (0, 1)]
+        halves, swapped = ([one.result() for one in each] for each in asked)
+    rows = [json.dumps(row) for row in rows_of(halves, swapped)]
+    print("\n".join(rows))
     if arguments.out:
-        arguments.out.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        arguments.out.write_text("".join(f"{row}\n" for row in rows))
 
 
 if __name__ == "__main__":
