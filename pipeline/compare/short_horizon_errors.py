@@ -159,10 +159,12 @@ def _whole(world: World, episodes: Sequence[Episode], prepared: Prepared, bodies
     """Return the full episodes in the world's order of bodies, without outliers."""
     whole = whole_episodes(world, episodes)
     columns = [list(bodies).index(world.bodies[k].name) for k in whole.free]
+    shift = prepared.observations.time_shift
     return replace(
         whole,
         seen=prepared.observations.seen[..., columns],
         has_orientation=prepared.observations.has_orientation[..., columns],
+        time_shift=None if shift is None else shift[:, :, columns],
     )
 
 

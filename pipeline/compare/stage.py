@@ -27,6 +27,7 @@ from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.prepare import Prepared, prepare
 from ..segments.random_effects import with_fitted_groups
 from ..segments.release_detection import after_release
+from ..trajectories.frame_times import episodes_at_clock
 from .frames import footage_of
 from .model_comparison import ComparedModel
 from .page import comparison_html, mark_of
@@ -122,10 +123,10 @@ def compare_models(
     shared = [name for name in names if all(any(e.errors.episode == name for e in ev.episodes) for ev in evaluations)]
     if not shared:
         raise InputDataError("no episode can be predicted by all models.", todo="run 'cgwm eval' with each model.")
-    episodes: list[Episode] = [Episode(name, capture.tracks(name)) for name in shared]
     first, given = World.from_model(models[0][1]), capture.manifest.measurement
-    prepared = prepare(first, episodes, (given.position_std_m, given.rotation_std_rad))
     bodies = [first.bodies[k].name for k in first.tracked]
+    episodes, clocked = episodes_at_clock(capture, shared, bodies)
+    prepared = prepare(first, episodes, (given.position_std_m, given.rotation_std_rad))
     compared = _with_short_predictions(models, evaluations, capture, episodes, prepared, bodies)
     figures = tuple(one.figures() for one in compared)
     best = min(figures, key=lambda one: one.translation_error_m.median)
@@ -141,6 +142,7 @@ def compare_models(
         warnings=(
             *_fitted_to_them(compared, capture, shared),
             *_left_out(names, shared),
+            *clocked,
             *prepared.warnings,
         ),
     )

@@ -22,7 +22,7 @@ from ..segments.prepare import Prepared
 from ..segments.repeated_forces import RepeatedForce, repeated_force
 from ..segments.residual_wrench import Omnibus, ResidualWrenches, dispersion, wrench_windows
 from ..segments.segments import Segments
-from ..segments.slow_errors import SlowErrors, flight_errors
+from ..segments.slow_errors import SlowErrors, flight_errors, tell_errors
 from .alternative_laws import OtherLaw
 from .effect_selection import SelectionStep, repeats
 from .falsification import Consistency
@@ -94,6 +94,11 @@ class FlightFindings:
     def repeats(self) -> bool:
         """Whether a residual repeats from episode to episode beside the selected effects."""
         return self.left is not None and self.left.p_value < LIMITS.repeated_p
+
+    @property
+    def untold(self) -> bool:
+        """Whether what is left may be errors of the tracking that last, which too few flights cannot show."""
+        return not (self.prepared.noise_model.correlated or tell_errors(self.prepared))
 
     @property
     def left_constant(self) -> bool:

@@ -89,7 +89,7 @@ def _residuals(segments: Segments) -> tuple[float, float | None]:
         kind=segments.kind,
         world=segments.world,
         items=segments.items,
-        observations=segments.observations,
+        observations=replace(segments.observations, time_shift=None),
         noise=segments.noise,
         noise_model=WHITE,
     )
@@ -106,7 +106,8 @@ def misfits_of(contact: Segments) -> list[PhaseMisfit]:
     """Return how each phase of contact is described, the worst first, from segments with fitted states."""
     none = contact.world.gravity.new_zeros(0)
     chi2 = contact.residuals([], none, jacobian=False)[0].square().flatten(1).sum(1) / contact.dof.clamp_min(1.0)
-    plain = replace(contact, noise_model=WHITE).residuals([], none, jacobian=False)[0]
+    seen = replace(contact.observations, time_shift=None)
+    plain = replace(contact, noise_model=WHITE, observations=seen).residuals([], none, jacobian=False)[0]
     causes = [_cause(phases) for phases in contact_phases(contact)]
     found = []
     for phase in PHASES[1:]:

@@ -124,7 +124,7 @@ def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
     episodes that they were not fitted to have to explain what repeats from episode to episode; all others nearly all.
     """
     too_little = is_significant(flown.after) and flown.explained_share < LIMITS.enough_share
-    errors = flown.slow is not None or (flown.predicts and not flown.repeats)
+    errors = flown.slow is not None or (flown.predicts and not (flown.repeats or flown.untold))
     if flown.doubtful or (too_little and not errors):
         return "unexplained"
     if not chosen and flown.remains and not flown.differs:

@@ -17,6 +17,11 @@ from .thresholds import THRESHOLDS
 from .verdict import Findings
 
 _DIFFERS = " Something is left in flight; it differs from episode to episode, as errors of the tracking do."
+_UNTOLD = (
+    "Something is left in flight beside independent errors, but the flights are too few or too short to tell a force "
+    "from errors of the tracking that last over several frames. Record longer flights, more of them, or more frames a "
+    "second."
+)
 _INEXACT = "the law of contact does not describe all of the motion"
 _PHASE_WORDS = {"impact": "impacts", "sliding": "slides", "rolling": "rolling", "sticking": "tipping", "rest": "rest"}
 _ORGANISED = {
@@ -50,9 +55,10 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
     if findings.verdict == "law_inexact":
         return f"No effect is named, but {_INEXACT}: {_misfit(findings)}{_described(findings)}"
     if findings.verdict == "unexplained":
+        if findings.flight.untold:
+            return _UNTOLD
         where = f" {organised(law.where)}" if law is not None else ""
-        what = f"Something is missing in flight, and none of the candidates explains it.{where}{_own(findings)}"
-        return f"{what}{_timed(findings)}"
+        return f"Something is missing in flight, and none of the candidates explains it.{where}{_own(findings)}"
     words = []
     for one in findings.chosen:
         others = [e.candidate.spec for e in one.equals[1:]]
@@ -106,14 +112,6 @@ def _own(findings: Findings) -> str:
             "of a spin: measure the spin."
         )
     return f" Each episode is pushed in another direction, which follows its {law}."
-
-
-def _timed(findings: Findings) -> str:
-    """Return what errors of the frames' times may do; empty where there are none."""
-    wrong_s = findings.flight.prepared.time_error_s
-    if not wrong_s:
-        return ""
-    return f" Times of frames that are wrong by {1e3 * wrong_s:.2g} ms may be all of it: mend them first."
 
 
 def _apart(findings: Findings) -> str:

@@ -30,6 +30,7 @@ from ..runtime.resources import enough_memory, one_torch_thread
 from ..segments.group_parameters import group_parameters, with_known_groups
 from ..segments.random_effects import with_fitted_groups
 from ..segments.release_detection import from_releases
+from ..trajectories.frame_times import episodes_at_clock
 from ..trajectories.track_noise import Noise, noise_of
 from .episode_errors import episode_errors, video_mean, within
 from .image_errors import VideoComparison, VideoErrors
@@ -125,7 +126,10 @@ def evaluate_model(
     """
     check_bodies(model, capture.body_names, str(capture.root))
     world = World.from_model(model)
-    episodes, warnings = _usable(model, [Episode(name, capture.tracks(name)) for name in capture.episodes(split)])
+    free = {body.name for body in model.file.bodies if body.motion == "free"}
+    timed, clocked = episodes_at_clock(capture, capture.episodes(split), free)
+    episodes, warnings = _usable(model, timed)
+    warnings += clocked
     if not episodes:
         raise InputDataError(
             f"{capture.root}: no episode of split '{split}' can be evaluated. {' '.join(warnings)}".rstrip(),

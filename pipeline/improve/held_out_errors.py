@@ -24,6 +24,7 @@ from ..segments.random_effects import with_fitted_groups
 from ..segments.release_detection import after_release
 from ..segments.segment_states import fit_states
 from ..segments.segments import Kind, Segments
+from ..trajectories.frame_times import episodes_at_clock
 from ..trajectories.segmentation import Segment, whole_episodes
 
 LEAST_FOR_STUDENT = 3
@@ -46,9 +47,9 @@ class HeldOutErrors(FileModel):
 @one_torch_thread()
 def prepared_episodes(model: Model, capture: Capture, names: Sequence[str]) -> tuple[list[Episode], Prepared]:
     """Return episodes and their segments, which are the same for all models that are compared on them."""
-    episodes = [Episode(name, capture.tracks(name)) for name in names]
-    given = capture.manifest.measurement
-    return episodes, prepare(World.from_model(model), episodes, (given.position_std_m, given.rotation_std_rad))
+    world, given = World.from_model(model), capture.manifest.measurement
+    episodes, _ = episodes_at_clock(capture, names, [world.bodies[k].name for k in world.tracked])
+    return episodes, prepare(world, episodes, (given.position_std_m, given.rotation_std_rad))
 
 
 @one_torch_thread()
@@ -71,6 +72,7 @@ def typical_errors(model: Model, capture: Capture, episodes: Sequence[Episode], 
         whole_episodes(world, episodes),
         seen=prepared.observations.seen,
         has_orientation=prepared.observations.has_orientation,
+        time_shift=prepared.observations.time_shift,
     )
     errors: dict[str, dict[str, float]] = {}
     kinds: tuple[tuple[Kind, Sequence[Segment]], ...] = (

@@ -89,7 +89,9 @@ def fit_motion(
     fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
     ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
     if config.supervise == "tracks" and not ready.file.articulations:
-        described = not_described(World.from_model(ready), track_episodes(capture, split), found.noise)
+        free = {body.name for body in ready.file.bodies if body.motion == "free"}
+        timed = with_regular_times(track_episodes(capture, split), free)[0]
+        described = not_described(World.from_model(ready), timed, found.noise)
         ready = replace(ready, file=ready.file.model_copy(update={"not_described": described}))
     if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
         ready = _with_appearance(ready, capture, split, config, found)

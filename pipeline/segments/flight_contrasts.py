@@ -38,6 +38,10 @@ class FlightContrasts:
     """Directions that all effects together span, shape (B, n, 3, P)."""
     axes: Tensor
     """Measured axes, shape (B, 3)."""
+    timed: Tensor | None = None
+    """Variances that errors of the frames' times add, in sigmas squared, shape (B, n, 3); None where times are right.
+    What they add to the covariance of two axes is left out: the axes of each flight are those along and across its
+    motion, of which one has hardly any errors of times."""
 
     @property
     def count(self) -> float:
@@ -47,7 +51,13 @@ class FlightContrasts:
 
     @staticmethod
     def of(
-        segments: Segments, rows: Tensor, jacobian: Tensor, count: int, kind: int, spacing_s: float = 0.0
+        segments: Segments,
+        rows: Tensor,
+        jacobian: Tensor,
+        count: int,
+        kind: int,
+        spacing_s: float = 0.0,
+        alike: tuple[int, ...] = (0, 1, 2),
     ) -> FlightContrasts | None:
         """Choose frames and axes of positions (kind 0) or rotations (1) of the first free body; None without any.
 
@@ -58,6 +68,7 @@ class FlightContrasts:
             count: Number P of the effects' parameters.
             kind: 0 or 1.
             spacing_s: Least time between the frames.
+            alike: Axes of which errors are alike, so that a flight's may be turned.
         """
         seen = segments.observations
         mask = (seen.seen, seen.has_orientation)[kind][:, :, 0]
@@ -73,11 +84,26 @@ class FlightContrasts:
         weight = inside[:, :, None] * axes[:, None]
         at = rows[:, ::bodies][item, place][..., columns] * weight
         slopes = torch.nan_to_num(jacobian[:, ::bodies][item, place][:, :, columns]) * weight[..., None]
+        timed = None
+        if seen.time_shift is not None:
+            shift = seen.time_shift[:, :, 0][item, place][..., columns] / segments.noise[kind] * weight
+            turn = _turns(shift, alike) if bool((axes > 0).all()) else torch.eye(3).to(rows).expand(len(picked), 3, 3)
+            timed, at = (shift @ turn).square(), at @ turn
+            slopes = torch.einsum("bnaq,bac->bncq", slopes, turn)
         common, own = slopes[..., :count], slopes[..., count:]
         other = jacobian[:, ::bodies][item, place][:, :, slice(3 - 3 * kind, 6 - 3 * kind), count:]
         seen_there = (seen.has_orientation, seen.seen)[kind][:, :, 0][item, place] * inside
         own = own[..., moving(own, torch.nan_to_num(other) * seen_there[:, :, None, None])]
-        return FlightContrasts(seen.times_s[item, place], inside, at, own, _spanned(common, own), axes)
+        return FlightContrasts(seen.times_s[item, place], inside, at, own, _spanned(common, own), axes, timed)
+
+
+def _turns(shift: Tensor, alike: tuple[int, ...]) -> Tensor:
+    """Return the turns (B, 3, 3) of some axes, by which these lie along and across motions (B, n, 3)."""
+    turn = torch.eye(3).to(shift).repeat(len(shift), 1, 1)
+    if len(alike) > 1:
+        places = torch.tensor(alike)
+        turn[:, places[:, None], places] = torch.linalg.svd(shift[..., places], full_matrices=False)[2].mT
+    return turn
 
 
 def moving(own: Tensor, other: Tensor) -> list[int]:

@@ -16,10 +16,10 @@ from ...datasets.capture.tracks import Episode
 from ..physics.world import World
 from ..trajectories.correlated_noise import estimate_noise_model, noise_model_warnings
 from ..trajectories.flight_noise import flight_noise, slow_noise, without_outliers
-from ..trajectories.frame_times import time_errors
 from ..trajectories.innovations import WHITE, NoiseModel
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, supported_frames, whole_episodes
+from ..trajectories.time_errors import time_errors, time_shifts
 from ..trajectories.track_noise import Noise, noise_of
 from .carried_starts import carried_starts
 from .contact_phases import is_round
@@ -152,9 +152,11 @@ def prepare(
         state.fit_flights()  # links do not fall as bodies do, by which the following steps judge
     else:
         _mark_supported_frames(state)
+        _measure_times(state)
         _remove_outliers(state)
         _remove_held_starts(state)
         _measure_times(state)
+        state.warnings += _time_warnings(state)
         _model_correlated_noise(state)
     left_out = _left_out(state, world, episodes)
     turned = state.oriented
@@ -217,6 +219,8 @@ class _State:
     """Correlation of the errors in time."""
     time_error_s: float = 0.0
     """Standard deviation of errors of the frames' times [s]; 0 where flights show none."""
+    across_m: float = 0.0
+    """Standard deviation of errors across the motion [m], beside these."""
     fitted: Segments | None = None
     """The flights with fitted states; None where there are none."""
     warnings: list[str] = field(default_factory=list)
@@ -351,19 +355,31 @@ def _times_words(name: str, times_s: Sequence[float]) -> str:
 
 
 def _measure_times(state: _State) -> None:
-    """Measure the errors of the frames' times, and say what they do where there are any."""
-    state.time_error_s, std_m = time_errors(state.observations, state.flight)
-    if state.time_error_s:
-        state.warnings.append(
-            f"the times of the frames are wrong by {1e3 * state.time_error_s:.2g} ms: errors along the motion grow "
-            f"with the speed, where those across it are {1e3 * std_m:.2g} mm. They hide small forces and may look like "
-            "one. Record the times of the exposures, or trigger the shutter by a clock."
-        )
+    """Measure the errors of the frames' times; where there are any, they are part of the noise from here on."""
+    before, (state.time_error_s, state.across_m) = state.time_error_s, time_errors(state.observations, state.flight)
+    if not (state.time_error_s or before):
+        return
+    shift = time_shifts(state.observations, state.time_error_s) if state.time_error_s else None
+    state.observations = replace(state.observations, time_shift=shift)
+    state.measure_noise(state.flight, [])
+    if state.fitted is not None:
+        state.fit_flights()
+
+
+def _time_warnings(state: _State) -> list[str]:
+    """Return a warning that says what errors of times do; none where times are right."""
+    if not state.time_error_s:
+        return []
+    return [
+        f"the times of the frames are wrong by {1e3 * state.time_error_s:.2g} ms: errors along the motion grow with "
+        f"the speed, where those across it are {1e3 * state.across_m:.2g} mm. This is modelled, and makes small forces "
+        "harder to detect. Record the times of the exposures, or trigger the shutter by a clock."
+    ]
 
 
 def _model_correlated_noise(state: _State) -> None:
     """Estimate how errors are correlated in time; where they are, cut and fit again with that noise model."""
-    state.noise_model, correlated = estimate_noise_model(state.observations, state.flight)
+    state.noise_model, correlated = estimate_noise_model(state.observations, state.flight, state.noise)
     if state.noise_model == WHITE:
         return
     position, rotation = (max(c or n, g or 0.0) for c, n, g in zip(correlated, state.noise, state.given, strict=True))

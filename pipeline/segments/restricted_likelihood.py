@@ -129,7 +129,8 @@ class RestrictedLikelihood:
         """
         level = self.level if sizes.sway is not None else ()
         rest = tuple(axis for axis in range(3) if axis not in level)
-        parts = [self._axes(sizes, axes, axes == level) for axes in (level, rest) if axes]
+        alike = (level, rest) if self.flights.timed is None else [(axis,) for axis in range(3)]
+        parts = [self._axes(sizes, axes, axes[0] in level) for axes in alike if axes]
         own = self.flights.own.shape[-1]
         normal = torch.stack([torch.einsum("bnac,bnad->bcd", part.columns, part.weighed) for part in parts]).sum(0)
         root = _root(normal[:, :own, :own])
@@ -145,6 +146,8 @@ class RestrictedLikelihood:
     def _axes(self, sizes: Components, axes: tuple[int, ...], sways: bool) -> _Axes:
         """Return what is needed of some axes, whose covariance has the flights' own accelerations or not."""
         covariance, slopes = self._covariance(sizes, sways)
+        if self.flights.timed is not None:
+            covariance = covariance + torch.diag_embed(self.flights.mask * self.flights.timed[..., axes[0]])
         root = torch.linalg.cholesky(covariance)
         inverse = torch.cholesky_inverse(root)
         columns = self._columns[:, :, axes]

@@ -18,10 +18,11 @@ from ..physics.observation_model import measure, true_times
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
 from ..physics.world import State, World
-from ..trajectories.innovations import WHITE, NoiseModel, axis_innovations
+from ..trajectories.innovations import WHITE, NoiseModel, body_innovations
 from ..trajectories.observations import Observations, with_spins
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, retract
 from ..trajectories.segmentation import Segment
+from ..trajectories.time_errors import without_time_errors
 from ..trajectories.track_noise import Noise
 
 Kind = Literal["flight", "contact"]
@@ -134,7 +135,8 @@ class Segments:
     ) -> tuple[Tensor, Tensor | None]:
         """Return residuals (B, T nf, 6) in sigmas and, if wanted, their Jacobian (B, T nf, 6, P + S).
 
-        With correlated noise they are the innovations, see `correlated_noise`.
+        With correlated noise they are the innovations, see `correlated_noise`; beside errors of the frames' times, less
+        what these explain, see `time_errors`.
 
         The Jacobian is one of differences: in contact they smooth the roughness of a step, and in flight, which is
         smooth, they cost a sixth of exact derivatives and agree with them to 1e-4.
@@ -152,8 +154,8 @@ class Segments:
             problem = replace(self._problem(parameters, some), parameter_steps=steps)
             shared = values if values.ndim == 1 else values[places]
             rows, slopes = problem(shared, torch.zeros(len(places), size).to(self.world.gravity), jacobian)
-            fresh = None if slopes is None else _innovations(some, slopes, self.noise_model)
-            parts.append((_innovations(some, rows, self.noise_model), fresh))
+            fresh = None if slopes is None else self._innovations(some, slopes)
+            parts.append((self._innovations(some, rows), fresh))
         rows = torch.cat([r for r, _ in parts])
         return rows, torch.cat([j for _, j in parts if j is not None]) if jacobian else None
 
@@ -174,12 +176,22 @@ class Segments:
         for places in self.chunks(len(values)):
             some = self.observations.select(places)
             rows = self._problem(parameters, some).varied(values[:, places], changes[:, places])
-            parts.append(_innovations(some, rows.movedim(0, -1), self.noise_model).movedim(-1, 0))
+            parts.append(self._innovations(some, rows.movedim(0, -1)).movedim(-1, 0))
         return torch.cat(parts, 1)
 
     def innovations(self, rows: Tensor) -> Tensor:
         """Return rows (B, T nf, 6, ...) as innovations: less what the correlated errors of earlier frames predict."""
-        return _innovations(self.observations, rows, self.noise_model)
+        return self._innovations(self.observations, rows)
+
+    def _innovations(self, seen: Observations, rows: Tensor) -> Tensor:
+        """Return rows (B, T nf, 6, ...) of some of the segments as innovations, less what errors of times explain."""
+        masks = torch.stack((seen.seen, seen.has_orientation), -1)
+        found = body_innovations(rows, seen.times_s, masks, self.noise_model)
+        if seen.time_shift is None:
+            return found
+        shifts = seen.time_shift * masks.repeat_interleave(3, -1)
+        shifts = shifts / torch.tensor(self.noise).repeat_interleave(3).to(shifts)
+        return without_time_errors(found, shifts, seen.times_s, masks, self.noise_model)
 
     def slopes(self, parameters: Sequence[Parameter], values: Tensor, rows: Tensor) -> Tensor:
         """Return derivatives (B, T nf, 6, P) of the residuals by parameters alone, by one-sided differences.
@@ -221,20 +233,6 @@ class Segments:
     def moved(self, change: Tensor) -> Segments:
         """Return the segments with their states moved by changes (B, S)."""
         return self.with_state(retract(self.observations.state, change, self.observations.free))
-
-
-def _innovations(seen: Observations, rows: Tensor, memory: NoiseModel) -> Tensor:
-    """Return the innovations of rows (B, T nf, 6, ...) for each free body."""
-    if memory == WHITE:
-        return rows
-    bodies = len(seen.free)
-    by_body = rows.unflatten(1, (-1, bodies)).movedim(2, 1).flatten(0, 1)  # (B nf, T, 6, ...)
-    times = seen.times_s.repeat_interleave(bodies, 0)
-    parts = [
-        part if noise.white else axis_innovations(part, times, mask.movedim(2, 1).flatten(0, 1), noise)
-        for part, mask, noise in zip(by_body.split(3, 2), (seen.seen, seen.has_orientation), memory, strict=True)
-    ]
-    return torch.cat(parts, 2).unflatten(0, (-1, bodies)).movedim(1, 2).flatten(1, 2)
 
 
 def _difference(parameter: Parameter) -> tuple[float, float]:
@@ -279,6 +277,8 @@ def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
     if whole.spin_rad_s is not None:
         spin = whole.spin_rad_s[rows[:, None], place]
         picked["spin_rad_s"] = torch.where(inside[..., None, None] > 0, spin, torch.nan)
+    if whole.time_shift is not None:
+        picked["time_shift"] = whole.time_shift[rows[:, None], place]
     own = {name: value[rows] for name, value in whole.own_values.items()}
     return replace(whole, names=names, times_s=times, drives=drives, state=state, own_values=own, **picked)
 

@@ -67,7 +67,9 @@ class StartedSliding:
         """
         if not isinstance(world.contact, ContactLaw) or not prepared.has_orientation:
             return None
-        prepared = replace(prepared, observations=without_grounded_bursts(prepared.observations, prepared.airborne))
+        prepared = replace(
+            prepared, observations=without_grounded_bursts(prepared.observations, prepared.airborne, prepared.noise)
+        )
         items = find_sliding_segments(world, prepared.observations, prepared.airborne, prepared.noise)
         if not items:
             return None

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from ...datasets.io.progress import note
 from ..physics.world import World
-from ..trajectories.innovations import WHITE, CorrelatedNoise, NoiseModel, axis_innovations
+from ..trajectories.innovations import WHITE, CorrelatedNoise, NoiseModel
 from ..trajectories.segmentation import Segment
 from ..trajectories.track_noise import FLOOR_M, FLOOR_RAD
 from .candidates import Variant
@@ -101,7 +101,7 @@ def flight_errors(prepared: Prepared, world: World, variants: Sequence[Variant])
     if prepared.flight is None:
         return None
     every = whole_flights(prepared.flight.items)
-    items = [i for i in every if i.last - i.first + 1 >= SHORTEST]
+    items = _long_ones(every)
     if len({item.episode for item in items}) < LIMITS.least_episodes:
         return None
     chosen = np.linspace(0, len(items) - 1, min(len(items), FLIGHTS)).round().astype(int)
@@ -112,6 +112,23 @@ def flight_errors(prepared: Prepared, world: World, variants: Sequence[Variant])
     return replace(found, flights=tuple(item for item in every if item not in wrong))
 
 
+def tell_errors(prepared: Prepared) -> bool:
+    """Return whether flights are enough to tell errors of the tracking that last from forces.
+
+    Args:
+        prepared: The episodes.
+    """
+    items = [] if prepared.flight is None else _long_ones(whole_flights(prepared.flight.items))
+    seen = prepared.observations.seen[..., 0]
+    frames = sum(int((seen[item.episode, item.first : item.last + 1] > 0).sum()) for item in items)
+    return len({item.episode for item in items}) >= LIMITS.least_episodes and frames >= LIMITS.least_frames
+
+
+def _long_ones(flights: Sequence[Segment]) -> list[Segment]:
+    """Return the flights with enough frames."""
+    return [item for item in flights if item.last - item.first + 1 >= SHORTEST]
+
+
 def _of_flights(
     prepared: Prepared, world: World, variants: Sequence[Variant], items: Sequence[Segment]
 ) -> tuple[SlowErrors | None, list[Segment]]:
@@ -120,19 +137,19 @@ def _of_flights(
     The components are None where the tracks' noise explains the flights, and all count.
     """
     fitted = fit_states(prepared.segments("flight", world, items))
-    plain = Segments.of("flight", world, prepared.observations, items, prepared.noise, WHITE)
+    plain = Segments.of("flight", world, replace(prepared.observations, time_shift=None), items, prepared.noise, WHITE)
     plain = plain.with_state(fitted.observations.state)
     parameters, rows, jacobian = derivatives(plain, world, variants)
     jacobian[..., : len(parameters)] *= torch.tensor([p.prior[1] for p in parameters]).to(jacobian)
-    sound = _sound_flights(plain, rows, jacobian, prepared.noise_model)
+    sound = _sound_flights(fitted, rows, jacobian)
     wrong = [item for k, item in enumerate(items) if k not in sound]
-    plain, rows, jacobian = plain.select(sound), rows[sound], jacobian[sound]
-    timed = _timed_forces(plain)
+    chosen, rows, jacobian = fitted.select(sound), rows[sound], jacobian[sound]
+    timed = _timed_forces(chosen)
     jacobian = torch.cat((timed, jacobian), -1)
     found, still, evidence, sway_evidence = [], [], 0.0, 0.0
     for kind, known in enumerate(prepared.noise_model):
         level = tuple(_level_axes(world)) if kind == 0 else ()
-        parts = _parts(plain, (rows, jacobian), len(parameters) + timed.shape[-1], kind, known, level)
+        parts = _parts(chosen, (rows, jacobian), len(parameters) + timed.shape[-1], kind, known, level)
         floor = (FLOOR_M, FLOOR_RAD)[kind] / prepared.noise[kind]
         if parts is None or max(parts[0].slow, parts[0].size) <= floor:
             parts = known, known, 0.0, 0.0
@@ -161,10 +178,10 @@ def _parts(
     """
     parts, spacing_s = None, SPACING * min(known.time_s, FAST_S) if known.share else 0.0
     for _ in range(THINNED if spacing_s else 1):
-        contrasts = FlightContrasts.of(flights, *linear, count, kind, spacing_s)
+        contrasts = FlightContrasts.of(flights, *linear, count, kind, spacing_s, level or (0, 1, 2))
         while spacing_s and (contrasts is None or contrasts.count < LIMITS.least_frames):
             spacing_s = spacing_s / 2 if spacing_s > FASTEST_S else 0.0
-            contrasts = FlightContrasts.of(flights, *linear, count, kind, spacing_s)
+            contrasts = FlightContrasts.of(flights, *linear, count, kind, spacing_s, level or (0, 1, 2))
         if contrasts is None:
             return parts
         parts = variance_components(contrasts, known, level)
@@ -204,19 +221,18 @@ def _level_axes(world: World) -> list[int]:
     return [axis for axis in range(3) if float(gravity[axis]) < float(gravity.max()) or float(gravity.max()) == 0]
 
 
-def _sound_flights(segments: Segments, rows: Tensor, jacobian: Tensor, noise: NoiseModel) -> list[int]:
+def _sound_flights(segments: Segments, rows: Tensor, jacobian: Tensor) -> list[int]:
     """Return the flights (B) without those in which effects of any size leave larger errors than elsewhere.
 
     Args:
-        segments: The flights.
+        segments: The flights, with the noise of short windows.
         rows: Residuals (B, F, 6) in sigmas of white noise.
         jacobian: Their derivatives (B, F, 6, P + S) by all effects, of usual size, and states.
-        noise: The noise model of short windows.
     """
     every = list(range(len(rows)))
     if len(segments.observations.free) > 1:
         return every
-    square, count = _left(segments, rows, jacobian, noise)
+    square, count = _left(segments, rows, jacobian)
     told = count >= LEAST_COUNT
     if int(told.sum()) < LIMITS.least_episodes:
         return every
@@ -226,16 +242,13 @@ def _sound_flights(segments: Segments, rows: Tensor, jacobian: Tensor, noise: No
     return chosen if len({segments.items[k].episode for k in chosen}) >= LIMITS.least_episodes else every
 
 
-def _left(segments: Segments, rows: Tensor, jacobian: Tensor, noise: NoiseModel) -> tuple[Tensor, Tensor]:
+def _left(segments: Segments, rows: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
     """Return what each flight's own state and effects leave: sums of squares (B,) and degrees of freedom (B,)."""
     seen = segments.observations
     every = torch.nan_to_num(torch.cat((rows[..., None], jacobian), -1))
     masks = (seen.seen[..., 0], seen.has_orientation[..., 0])
-    white = [
-        axis_innovations(every[:, :, 3 * k : 3 * k + 3], seen.times_s, mask, one) * mask[..., None, None]
-        for k, (mask, one) in enumerate(zip(masks, noise, strict=True))
-    ]
-    flat = torch.cat(white, 2).flatten(1, 2)
+    known = torch.stack(masks, -1).repeat_interleave(3, -1)
+    flat = (segments.innovations(every) * known[..., None]).flatten(1, 2)
     left, slopes = flat[..., 0], flat[..., 1:]
     length = slopes.norm(dim=1, keepdim=True)
     basis, size, _ = torch.linalg.svd(slopes * torch.where(length > LEAST_MOVE, 1 / length, 0.0), full_matrices=False)

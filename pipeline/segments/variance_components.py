@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from ..optimization.least_squares import Policy, descend
 from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
@@ -27,6 +29,8 @@ STARTS_S = (0.1, 0.4)
 """Times of the slow process from which the likelihood is climbed [s]."""
 LEAST_STD = 0.02
 """Smallest standard deviation of a component, in units of that of the tracks."""
+WHITE_LOGS = (math.log(0.2), math.log(50.0))
+"""Range of the logarithm of the standard deviation of independent errors alone, in units of that of the tracks."""
 STEPS = 30
 """Maximum number of steps of a climb."""
 LONGEST, ENOUGH = 1.5, 0.01
@@ -43,7 +47,7 @@ def variance_components(
 ) -> tuple[CorrelatedNoise, CorrelatedNoise, float, float]:
     """Return the likeliest components, those without accelerations of the flights' own, and twice the gains by both.
 
-    Components without evidence are left out. Where nothing is left and windows show no correlation, neither do flights.
+    Components without evidence are left out, and a fast process for which neither windows nor flights speak.
     """
     likelihood = RestrictedLikelihood(contrasts, level)
     fast = [_climbed(likelihood, [_coded(known)], (), order) for order in FALLS]
@@ -52,7 +56,7 @@ def variance_components(
     slow, with_slow = _climbed(likelihood, starts, ("slow",), plain.order)
     gain = 2 * (with_slow - without)
     best, reached, sway_gain = (slow, with_slow, 0.0) if gain > LIMITS.evidence else (plain, without, 0.0)
-    usual = plain if known.share else known
+    usual = plain if known.share or 2 * (without - _white(likelihood)) > LIMITS.evidence else known
     still = best if best.slow else usual
     if level:
         span = float((contrasts.times_s[:, -1] - contrasts.times_s[:, 0]).median())
@@ -65,6 +69,17 @@ def variance_components(
             best = swaying
     gain = gain if best.slow else 0.0
     return (best if best.slow or best.sway else usual), still, gain, sway_gain if best.sway else 0.0
+
+
+def _white(likelihood: RestrictedLikelihood) -> float:
+    """Return the largest restricted log-likelihood of independent errors."""
+
+    def loss(log_std: float) -> float:
+        sizes = Components(white=math.exp(2 * log_std), fast=0.0, time_s=1.0, order=0.5)
+        return -likelihood.at(sizes).value
+
+    found: Any = minimize_scalar(loss, bounds=WHITE_LOGS, method="bounded", options={"xatol": 0.02})
+    return -float(found.fun)
 
 
 def _coded(noise: CorrelatedNoise) -> list[float]:

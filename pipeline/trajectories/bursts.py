@@ -21,7 +21,7 @@ from ..geometry.rotation import continuous_turns, quat_to_matrix
 from .observations import Observations
 from .segmentation import Segment
 from .thresholds import TRACK_THRESHOLDS
-from .track_noise import FLOOR_M, FLOOR_RAD, MAD_TO_STD, moves
+from .track_noise import FLOOR_M, FLOOR_RAD, MAD_TO_STD, Noise, moves
 
 LIMITS = TRACK_THRESHOLDS.track_noise
 Array = NDArray[np.float64]
@@ -94,15 +94,19 @@ class _Path:
         return len(self.frames) - self.basis.shape[2]
 
 
-def bursts(whole: Observations, flight: Sequence[Segment], kind: int) -> Iterator[tuple[int, NDArray[np.int64], int]]:
+def bursts(
+    whole: Observations, flight: Sequence[Segment], noise: Noise, kind: int
+) -> Iterator[tuple[int, NDArray[np.int64], int]]:
     """Yield episode, frames and body of the bursts in flights.
 
     Args:
         whole: The episodes.
         flight: Their flights.
+        noise: Standard deviations of the tracks, beside which errors of times count.
         kind: 0 for positions, 1 for rotations.
     """
-    paths = [path for item in flight for k in range(len(whole.free)) if (path := _path(whole, item, k, kind))]
+    every = range(len(whole.free))
+    paths = [path for item in flight for k in every if (path := _path(whole, item, k, kind, noise[kind]))]
     sigma = max(_usual(paths), (FLOOR_M, FLOOR_RAD)[kind])
     for path in paths:
         found = _found(path, sigma)
@@ -110,18 +114,19 @@ def bursts(whole: Observations, flight: Sequence[Segment], kind: int) -> Iterato
             yield path.episode, found, path.column
 
 
-def without_grounded_bursts(whole: Observations, airborne: Tensor) -> Observations:
+def without_grounded_bursts(whole: Observations, airborne: Tensor, noise: Noise) -> Observations:
     """Mark the bursts of motions on the ground as not measured.
 
     Args:
         whole: The episodes (E).
         airborne: Airborne frames (E, T).
+        noise: Standard deviations of the tracks.
     """
     pieces = list(_grounded(whole, airborne))
     seen, turned = whole.seen.clone(), whole.has_orientation.clone()
     for kind in (1, 0):  # a wrong turn would move a marker beside the centre of mass
         whole = replace(whole, seen=seen.clone(), has_orientation=turned.clone())
-        for episode, frames, column in bursts(whole, pieces, kind):
+        for episode, frames, column in bursts(whole, pieces, noise, kind):
             (seen, turned)[kind][episode, frames, column] = 0.0
     return replace(whole, seen=seen, has_orientation=turned)
 
@@ -139,8 +144,11 @@ def _grounded(whole: Observations, airborne: Tensor) -> Iterator[Segment]:
                 yield Segment(episode, int(run[first]), int(run[min(first + length, len(run) - 1)]))
 
 
-def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path | None:
-    """Return a flight's measurements of one kind; None of too few."""
+def _path(whole: Observations, item: Segment, column: int, kind: int, std: float) -> _Path | None:
+    """Return a flight's measurements of one kind; None of too few.
+
+    Beside errors of times they are divided by what these add to errors of a standard deviation `std`.
+    """
     frames = torch.arange(item.first, item.last + 1)
     masks = (whole.seen, whole.has_orientation)
     frames = frames[masks[kind][item.episode, frames, column] > 0]
@@ -166,12 +174,17 @@ def _path(whole: Observations, item: Segment, column: int, kind: int) -> _Path |
         basis = np.concatenate((basis, turn), 2)
     opens = item.first <= int((whole.seen[item.episode].amax(-1) > 0).to(torch.int64).argmax())
     free_s = t[0] + LIMITS.longest_burst_s * opens
+    values = values.astype(np.float64)
+    if whole.time_shift is not None:
+        shift = whole.time_shift[item.episode, frames, column, 3 * kind : 3 * kind + 3].numpy()[:, axes]
+        more = np.hypot(1.0, shift / std)
+        values, basis = values / more, basis / more.T[..., None]
     path = _Path(
         episode=item.episode,
         column=column,
         frames=frames.numpy(),
         time_s=t,
-        values=values.astype(np.float64),
+        values=values,
         basis=basis,
         free_s=free_s,
     )

@@ -26,7 +26,7 @@ from .innovations import MOST_NUMBERS, RESOLUTION_S, WHITE, CorrelatedNoise, Noi
 from .observations import Observations
 from .segmentation import Segment
 from .thresholds import TRACK_THRESHOLDS
-from .track_noise import FLOOR_M, FLOOR_RAD
+from .track_noise import FLOOR_M, FLOOR_RAD, Noise
 
 Array = NDArray[np.float64]
 LIMITS = TRACK_THRESHOLDS.track_noise
@@ -59,16 +59,23 @@ MOST_CORRELATED = 0.98
 
 
 def estimate_noise_model(
-    whole: Observations, flight: Sequence[Segment]
+    whole: Observations, flight: Sequence[Segment], tracks: Noise
 ) -> tuple[NoiseModel, tuple[float | None, float | None]]:
     """Estimate how the tracks' errors in flight are correlated, without any motion model, and how large they are.
 
     The evidence of positions and rotations is added, because a filter correlates both.
 
+    Args:
+        whole: The episodes (E).
+        flight: Their flight segments.
+        tracks: A first guess of the standard deviations, beside errors of the frames' times.
+
     Returns:
         The noise model; standard deviations of position [m] and rotation [rad], None for uncorrelated ones.
     """
-    found = [_likeliest(whole, flight, kind) for kind in (0, 1)]
+    found = [_likeliest(whole, flight, kind, tracks[kind]) for kind in (0, 1)]
+    if whole.time_shift is not None:  # how much times add to the errors is known in units of the latter
+        found = [_likeliest(whole, flight, k, one.std or tracks[k]) for k, one in enumerate(found)]
     if sum(one.evidence for one in found) < LIMITS.sure_both:
         return WHITE, (None, None)
     # rounding errors of exact values are correlated from frame to frame, too
@@ -93,12 +100,13 @@ def noise_model_warnings(memory: NoiseModel) -> str:
     )
 
 
-def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Found:
+def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int, std: float) -> _Found:
     """Return the likeliest noise model of positions (kind 0) or rotations (1).
 
     Restricted maximum likelihood (Patterson & Thompson 1971): of the residuals of a polynomial in every window.
+    Variances that errors of times add are in units of a standard deviation `std` of the tracks.
     """
-    windows = _windows(whole, flight, kind)
+    windows = _windows(whole, flight, kind, std)
     if sum(w.count for w in windows) < LIMITS.enough:
         return _Found(CorrelatedNoise(), 0.0, 0.0)
     sizes = np.concatenate([w.variances for w in windows])
@@ -119,14 +127,14 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int) -> _Fo
         tried += [CorrelatedNoise(share, time_s, order=order) for share in SHARES[order]]
         alike += [1 + 2 * float(matern(gaps, time_s, order).sum())] * len(SHARES[order])
     found = []
-    for noise, far, (likelihood, std) in zip(tried, alike, _likelihoods(windows, tried), strict=True):
-        slow = std**2 * (1 - noise.share + noise.share * far)
-        found.append((2 * (likelihood - alone), slow, noise, std))
+    for noise, far, (likelihood, size) in zip(tried, alike, _likelihoods(windows, tried), strict=True):
+        slow = size**2 * (1 - noise.share + noise.share * far)
+        found.append((2 * (likelihood - alone), slow, noise, size))
     most, _, _, likeliest = max(found)
     # forces are found from slow changes, where windows show the errors least: the larger slow part is the safe choice
-    likely = [(slow, noise, std) for evidence, slow, noise, std in found if evidence > most - LIMITS.likely]
-    _, noise, std = max(likely)
-    return _Found(noise._replace(size=std / likeliest), likeliest, most)
+    likely = [(slow, noise, size) for evidence, slow, noise, size in found if evidence > most - LIMITS.likely]
+    _, noise, size = max(likely)
+    return _Found(noise._replace(size=size / likeliest), likeliest, most)
 
 
 @dataclass(frozen=True)
@@ -153,6 +161,9 @@ class _Windows:
     """What the polynomials leave of the measurements, shape (W, n, c) [m or rad]."""
     columns: Array
     """Number of the measured columns of each window, shape (W,); further ones are zero."""
+    timed: Array | None = None
+    """Variances that errors of times add, in units of that of the others, shape (W, n, c); None where times are
+    right."""
 
     @property
     def both(self) -> Array:
@@ -177,10 +188,19 @@ class _Windows:
     def without(self, above: float) -> _Windows:
         """Return the windows whose variance is at most a limit."""
         kept = self.variances <= above
-        return _Windows(self.times_s[kept], self.basis[kept], self.left[kept], self.columns[kept])
+        timed = None if self.timed is None else self.timed[kept]
+        return _Windows(self.times_s[kept], self.basis[kept], self.left[kept], self.columns[kept], timed)
 
     def merged(self) -> _Windows:
-        """Return the windows with those of equal frame times as one: their covariance is decomposed once."""
+        """Return the windows with those of equal frame times as one: their covariance is decomposed once.
+
+        Beside errors of times each column has a covariance of its own, and becomes a window.
+        """
+        if self.timed is not None:
+            every = self.left.shape[2]
+            left, timed = (part.swapaxes(1, 2).reshape(-1, part.shape[1], 1) for part in (self.left, self.timed))
+            times, basis = (part.repeat(every, 0) for part in (self.times_s, self.basis))
+            return _Windows(times, basis, left, np.ones(len(left)), timed)
         grids = np.rint((self.times_s - self.times_s[:, :1]) / RESOLUTION_S)
         _, first, place = np.unique(grids, axis=0, return_index=True, return_inverse=True)
         groups = [self.left[place == k].swapaxes(0, 1).reshape(self.left.shape[1], -1) for k in range(len(first))]
@@ -210,7 +230,10 @@ def _likelihoods_together(windows: Sequence[_Windows], noises: Sequence[Correlat
     for w in windows:
         gap = torch.from_numpy(np.abs(w.times_s[:, :, None] - w.times_s[:, None]))
         alike = torch.stack([matern(gap, *law) for law in laws])[which]
-        factor = torch.linalg.cholesky(share * alike + (1 - share) * torch.eye(gap.shape[1], dtype=torch.float64))
+        covariance = share * alike + (1 - share) * torch.eye(gap.shape[1], dtype=torch.float64)
+        if w.timed is not None:
+            covariance = covariance + torch.diag_embed(torch.from_numpy(w.timed[:, :, 0]))
+        factor = torch.linalg.cholesky(covariance)
         whitened = torch.linalg.solve_triangular(factor, torch.from_numpy(w.both), upper=False)
         basis, left = whitened.tensor_split([w.basis.shape[2]], 3)
         inner = torch.linalg.cholesky(basis.mT @ basis)
@@ -224,10 +247,10 @@ def _likelihoods_together(windows: Sequence[_Windows], noises: Sequence[Correlat
     return list(zip(likelihood.tolist(), np.sqrt(variance).tolist(), strict=True))
 
 
-def _windows(whole: Observations, flight: Sequence[Segment], kind: int) -> list[_Windows]:
-    """Return the windows of all flights, grouped by length and degree."""
+def _windows(whole: Observations, flight: Sequence[Segment], kind: int, std: float) -> list[_Windows]:
+    """Return the windows of all flights, grouped by length and degree; `std`: standard deviation of the tracks."""
     mask = (whole.seen, whole.has_orientation)[kind]
-    found: dict[tuple[int, int, int], list[tuple[Array, Array, Array]]] = {}
+    found: dict[tuple[int, int, int], list[tuple[Array, ...]]] = {}
     for segment in flight:
         for column in range(len(whole.free)):
             frames = torch.arange(segment.first, segment.last + 1)
@@ -243,13 +266,21 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int) -> list[
                     values = whole.position_m[segment.episode, chosen, column].numpy()[:, axes]
                 else:
                     quat = whole.quat_wxyz[segment.episode, chosen, column]
-                    values = quat_log(quat_multiply(quat_conjugate(quat[length // 2]), quat)).numpy()
+                    values, axes = (
+                        quat_log(quat_multiply(quat_conjugate(quat[length // 2]), quat)).numpy(),
+                        np.ones(3, bool),
+                    )
+                timed: tuple[Array, ...] = ()
+                if whole.time_shift is not None:
+                    shift = whole.time_shift[segment.episode, chosen, column, 3 * kind : 3 * kind + 3].numpy()[:, axes]
+                    turn = np.linalg.svd(shift, full_matrices=False)[2].T  # across the motion there are no such errors
+                    values, timed = values @ turn, ((shift @ turn / std) ** 2,)
                 scaled = 2 * (t - t[0]) / (t[-1] - t[0]) - 1
                 basis = np.linalg.qr(np.vander(scaled, degree + 1))[0]
                 left = values - basis @ (basis.T @ values)
-                found.setdefault((length, degree, values.shape[1]), []).append((t, basis, left))
+                found.setdefault((length, degree, values.shape[1]), []).append((t, basis, left, *timed))
     stacked = [[np.stack(parts) for parts in zip(*some, strict=True)] for some in found.values()]
-    return [_Windows(t, basis, left, np.full(len(t), left.shape[2])) for t, basis, left in stacked]
+    return [_Windows(t, basis, left, np.full(len(t), left.shape[2]), *timed) for t, basis, left, *timed in stacked]
 
 
 def _window(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> tuple[int, int]:

@@ -23,6 +23,8 @@ DEGREE = 3
 """Degree of the polynomial that is removed from a window."""
 SLOW_DEGREE = 7
 """Orders from the fourth to this one contain slow errors of a window and almost nothing of the flight."""
+STEPS = 100
+"""Number of steps in which the noise beside errors of times is found."""
 MOST_CORRELATED = 0.95
 """Maximum correlation from frame to frame that is considered."""
 
@@ -34,10 +36,9 @@ def flight_noise(whole: Observations, flight: Sequence[Segment]) -> tuple[float 
     `keep_sigmas` of a first, robust estimate are left out. Windows of a body with measured orientation are short,
     because a point away from its centre of mass does not follow a long cubic. A cubic follows a part of errors that are
     correlated over several frames, such as those of smoothed tracks; the result is the standard deviation of the full
-    errors.
+    errors, without those of the frames' times.
     """
-    position, rotation = _residuals(whole, flight)
-    found = [_spread(position, FLOOR_M), _spread(rotation, FLOOR_RAD)]
+    found = [_spread(*_residuals(whole, flight, kind), (FLOOR_M, FLOOR_RAD)[kind]) for kind in (0, 1)]
     for kind in (0, 1):
         alone = found[kind]
         if alone is not None:
@@ -60,7 +61,7 @@ def slow_noise(whole: Observations, flight: Sequence[Segment]) -> float:
                 if len(chosen) <= SLOW_DEGREE + 1:
                     continue
                 t = whole.times_s[segment.episode, chosen].numpy()
-                values = _positions(whole, segment.episode, column, chosen)
+                values = _steadiest(whole, segment.episode, column, chosen)
                 q, _ = np.linalg.qr(np.vander((t - t.mean()) / (t[-1] - t[0]), SLOW_DEGREE + 1, increasing=True))
                 parts = (q.T @ values)[DEGREE + 1 :]
                 left = values - q[:, : DEGREE + 1] @ (q.T @ values)[: DEGREE + 1]
@@ -90,20 +91,21 @@ def without_outliers(whole: Observations, flight: Sequence[Segment], noise: Nois
             wrong |= {(kind, episode, int(frame), column) for frame in frames}
     for kind in (1, 0):  # a wrong turn would move a marker beside the centre of mass
         whole = replace(whole, seen=seen.clone(), has_orientation=turned.clone())
-        for episode, frames, column in bursts(whole, flight, kind):
+        for episode, frames, column in bursts(whole, flight, noise, kind):
             (seen, turned)[kind][episode, frames, column] = 0.0
             wrong |= {(kind, episode, int(frame), column) for frame in frames}
     count, whole = len(wrong), replace(whole, seen=seen.clone(), has_orientation=turned.clone())
     wrong.clear()
     for kind in (0, 1):
-        for segment, column, frames, away in _windows(whole, flight, kind, step=1):
-            size = np.abs(away).max(1) / noise[kind]
+        for segment, column, frames, away in _windows(whole, flight, noise, kind):
+            size = np.abs(away).max(1)
             if size.max() <= LIMITS.outlier_sigmas:
                 continue
             worst = int(size.argmax())
             rest = torch.as_tensor(np.delete(frames, worst))
             left = _cubic(whole, segment.episode, column, rest, kind)
-            if np.abs(left).max() / noise[kind] <= LIMITS.outlier_sigmas:
+            left = left / np.hypot(noise[kind], _shifts(whole, segment.episode, column, rest, kind))
+            if np.abs(left).max() <= LIMITS.outlier_sigmas:
                 wrong.add((kind, segment.episode, int(frames[worst]), column))
             else:
                 kinked[segment.episode, torch.as_tensor(frames)] = True
@@ -119,8 +121,8 @@ def _bursts(
 ) -> Iterator[tuple[int, np.ndarray, int]]:
     """Yield episode, frames and body of bursts: rows of wrong measurements between frames that lie on one cubic."""
     rough: dict[tuple[int, int, int, int], set[int]] = {}
-    for segment, column, frames, away in _windows(whole, flight, kind, step=1):
-        if np.abs(away).max() > LIMITS.outlier_sigmas * noise[kind]:
+    for segment, column, frames, away in _windows(whole, flight, noise, kind):
+        if np.abs(away).max() > LIMITS.outlier_sigmas:
             rough.setdefault((segment.episode, segment.first, segment.last, column), set()).update(frames.tolist())
     mask = (whole.seen, whole.has_orientation)[kind]
     for (episode, first, last, column), found in rough.items():
@@ -136,21 +138,25 @@ def _bursts(
             times = whole.times_s[episode].numpy()
             if times[inner[-1]] - times[inner[0]] > LIMITS.longest_burst_s or outside.sum() < WINDOW or outside.all():
                 continue
-            away = _off_cubic(whole, episode, column, frames, kind, outside) / noise[kind]
+            more = np.hypot(noise[kind], _shifts(whole, episode, column, torch.as_tensor(frames), kind))
+            away = _off_cubic(whole, episode, column, frames, kind, outside, more)
             wrong = frames[~outside & (away > LIMITS.keep_sigmas)]
             if away[outside].max() <= LIMITS.outlier_sigmas and len(wrong) >= LIMITS.least_burst:
                 yield episode, wrong, column
 
 
 def _off_cubic(
-    whole: Observations, episode: int, column: int, frames: np.ndarray, kind: int, fitted: np.ndarray
+    whole: Observations, episode: int, column: int, frames: np.ndarray, kind: int, fitted: np.ndarray, std: np.ndarray
 ) -> np.ndarray:
-    """Return how far each of the frames (n) is from the cubic through the fitted ones [m or rad], in any coordinate."""
+    """Return how far each of the frames (n) is from the cubic through the fitted ones, in any coordinate.
+
+    In standard deviations, of which `std` has each value's, shape (n, 1 to 3) [m or rad].
+    """
     chosen = torch.as_tensor(frames)
     t, values = _values(whole, episode, column, chosen, kind)
     powers = np.vander((t - t.mean()) / (t[-1] - t[0]), DEGREE + 1)
     coefficients = np.linalg.lstsq(powers[fitted], values[fitted], rcond=None)[0]
-    return np.abs(values - powers @ coefficients).max(1)
+    return (np.abs(values - powers @ coefficients) / std).max(1)
 
 
 def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: float) -> float:
@@ -190,27 +196,43 @@ def _hidden(whole: Observations, flight: Sequence[Segment], kind: int, noise: fl
     return float(np.sqrt(known / np.trace(left @ rho**gap)))
 
 
-def _residuals(whole: Observations, flight: Sequence[Segment]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the scaled residuals of positions [m] and of rotations [rad] of all windows."""
-    found = []
-    for kind in (0, 1):
-        parts = [
-            _cubic(whole, segment.episode, column, _frames(whole, segment, column, kind), kind).ravel()
-            for segment in flight
-            for column in range(len(whole.free))
-        ]
-        found.append(np.concatenate(parts) if parts else np.zeros(0))
-    return found[0], found[1]
+def _residuals(whole: Observations, flight: Sequence[Segment], kind: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the scaled residuals of positions [m] (kind 0) or rotations [rad] of all windows, and what times do."""
+    parts, shifts = [np.zeros(0)], [np.zeros(0)]
+    for segment in flight:
+        for column in range(len(whole.free)):
+            frames = _frames(whole, segment, column, kind)
+            parts.append(_cubic(whole, segment.episode, column, frames, kind).ravel())
+            shifts.append(_shifts(whole, segment.episode, column, frames, kind).ravel())
+    return np.concatenate(parts), np.concatenate(shifts)
 
 
-def _windows(whole: Observations, flight: Sequence[Segment], kind: int, step: int = 2):
-    """Yield segment, body, frames and standardised residuals (n, 1 to 3) [m or rad] of a cubic, window by window."""
+def _shifts(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> np.ndarray:
+    """Return what errors of the frames' times do to what is measured (..., n, 1 to 3) [m or rad]."""
+    axes = _moved(whole, episode, column) if kind == 0 else np.ones(3, bool)
+    if whole.time_shift is None:
+        return np.zeros((*frames.shape, int(axes.sum())))
+    return whole.time_shift[episode, frames, column, 3 * kind : 3 * kind + 3].numpy()[..., axes]
+
+
+def _steadiest(whole: Observations, episode: int, column: int, frames: Tensor) -> np.ndarray:
+    """Return measured coordinates (n, 1 to 3) [m]: that which errors of times move least, all where times are right."""
+    values = _positions(whole, episode, column, frames)
+    if whole.time_shift is None:
+        return values
+    least = int((_shifts(whole, episode, column, frames, 0) ** 2).sum(0).argmin())
+    return values[:, least : least + 1]
+
+
+def _windows(whole: Observations, flight: Sequence[Segment], noise: Noise, kind: int):
+    """Yield segment, body, frames and residuals (n, 1 to 3) of a cubic, in standard deviations, window by window."""
     mask = (whole.seen, whole.has_orientation)[kind]
     for segment in flight:
         for column in range(len(whole.free)):
             frames = torch.arange(segment.first, segment.last + 1)
-            windows = _split(frames[mask[segment.episode, frames, column] > 0], WINDOW, step)
+            windows = _split(frames[mask[segment.episode, frames, column] > 0], WINDOW, 1)
             away = _cubic(whole, segment.episode, column, windows, kind)
+            away = away / np.hypot(noise[kind], _shifts(whole, segment.episode, column, windows, kind))
             for chosen, residuals in zip(windows.numpy(), away, strict=True):
                 yield segment, column, chosen, residuals
 
@@ -236,8 +258,12 @@ def _frames(whole: Observations, segment: Segment, column: int, kind: int) -> Te
 
 def _positions(whole: Observations, episode: int, column: int, frames: Tensor) -> np.ndarray:
     """Return the measured coordinates (..., n, 1 to 3) [m]: those that change anywhere in the episode."""
-    measured = whole.position_m[episode, whole.seen[episode, :, column] > 0, column].numpy()
-    return whole.position_m[episode, frames, column].numpy()[..., moves(measured)]
+    return whole.position_m[episode, frames, column].numpy()[..., _moved(whole, episode, column)]
+
+
+def _moved(whole: Observations, episode: int, column: int) -> np.ndarray:
+    """Return which coordinates (3) change anywhere in an episode."""
+    return moves(whole.position_m[episode, whole.seen[episode, :, column] > 0, column].numpy())
 
 
 def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> np.ndarray:
@@ -249,13 +275,25 @@ def _cubic(whole: Observations, episode: int, column: int, frames: Tensor, kind:
     return (values - q @ (q.swapaxes(-1, -2) @ values)) / np.sqrt(left.clip(1e-6))
 
 
-def _spread(residuals: np.ndarray, floor: float) -> float | None:
-    """Return the standard deviation without outliers, at least a floor; None for too few residuals."""
+def _spread(residuals: np.ndarray, shifts: np.ndarray, floor: float) -> float | None:
+    """Return the standard deviation without outliers, at least a floor; None for too few residuals.
+
+    Args:
+        residuals: What cubics leave.
+        shifts: Standard deviations of what errors of times add to each; the likeliest one beside them is found by
+            expectation and maximisation (Dempster, Laird & Rubin 1977).
+        floor: Of the standard deviation.
+    """
     if len(residuals) < LIMITS.enough:
         return None
     first = MAD_TO_STD * float(np.median(np.abs(residuals)))
-    kept = residuals[np.abs(residuals) < LIMITS.keep_sigmas * max(first, floor)]
-    return max(float(np.sqrt(np.mean(kept**2))), floor)
+    kept = np.abs(residuals) < LIMITS.keep_sigmas * np.hypot(max(first, floor), shifts)
+    square, more = residuals[kept] ** 2, shifts[kept] ** 2
+    variance = float(np.mean(square))
+    for _ in range(STEPS if more.any() else 0):
+        share = variance / (variance + more)
+        variance = max(float(np.mean(share**2 * square + share * more)), floor**2)
+    return max(float(np.sqrt(variance)), floor)
 
 
 def _values(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> tuple[np.ndarray, np.ndarray]:

@@ -188,6 +188,27 @@ def axis_innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: Correla
     return found
 
 
+def body_innovations(rows: Tensor, times_s: Tensor, masks: Tensor, memory: NoiseModel) -> Tensor:
+    """Return the innovations of rows (B, T nf, 6, ...) of bodies: three axes of positions, three of rotations.
+
+    Args:
+        rows: Residuals in sigmas, or their derivatives.
+        times_s: Frame times (B, T).
+        masks: Frames that count, of positions and of rotations, shape (B, T, nf, 2).
+        memory: The noise model.
+    """
+    if memory == WHITE:
+        return rows
+    bodies = masks.shape[2]
+    by_body = rows.unflatten(1, (-1, bodies)).movedim(2, 1).flatten(0, 1)  # (B nf, T, 6, ...)
+    times, counted = times_s.repeat_interleave(bodies, 0), masks.movedim(2, 1).flatten(0, 1)
+    parts = [
+        part if noise.white else axis_innovations(part, times, mask, noise)
+        for part, mask, noise in zip(by_body.split(3, 2), counted.unbind(-1), memory, strict=True)
+    ]
+    return torch.cat(parts, 2).unflatten(0, (-1, bodies)).movedim(1, 2).flatten(1, 2)
+
+
 def _state_innovations(rows: Tensor, times_s: Tensor, mask: Tensor, noise: CorrelatedNoise) -> Tensor:
     """Return the innovations by a filter whose states are both processes and the acceleration of the flight."""
     square = noise.size**2

@@ -58,6 +58,9 @@ class Observations:
     spin_rad_s: Tensor | None = None
     """Measured spins of free bodies whose orientation was not measured, along the world's axes, shape (B, T, nf, 3)
     [rad/s]; NaN where there is none, and None without any."""
+    time_shift: Tensor | None = None
+    """How far one standard deviation of the error of a frame's time moves positions [m] and turns rotations [rad, body
+    axes], shape (B, T, nf, 6); None where times are right."""
 
     def with_own(self, world: World) -> Observations:
         """Return the items with the group-specific parameters that a world has for their episodes."""
@@ -133,6 +136,8 @@ class Observations:
         picked["measured_axes"] = self.measured_axes[index]
         if self.spin_rad_s is not None:
             picked["spin_rad_s"] = self.spin_rad_s[index]
+        if self.time_shift is not None:
+            picked["time_shift"] = self.time_shift[index]
         own = {name: value[index] for name, value in self.own_values.items()}
         return replace(self, names=names, drives=drives, state=self.state.at(index), own_values=own, **picked)
 

@@ -129,8 +129,8 @@ def test_an_orientation_that_never_changes_tells_nothing_of_noise(body: str) -> 
 
 def test_few_frames_tell_nothing() -> None:
     prepared, _ = ready("ball", {}, lasting(0.9, 3))
-    assert estimate_noise_model(prepared.observations, [prepared.flight.items[0]]) == (WHITE, (None, None))  # pyright: ignore
-    assert estimate_noise_model(prepared.observations, []) == (WHITE, (None, None))
+    assert estimate_noise_model(prepared.observations, [prepared.flight.items[0]], NOISE) == (WHITE, (None, None))  # pyright: ignore
+    assert estimate_noise_model(prepared.observations, [], NOISE) == (WHITE, (None, None))
 
 
 EACH = [pytest.param(lasting(0.8, 5), id="lasting", marks=pytest.mark.evidence), pytest.param(smoothed, id="smoothed")]

@@ -176,6 +176,19 @@ def test_centroid_tracks_have_no_rotation(tmp_path: Path) -> None:
     assert result.baselines["frozen"]["translation_error_m"]["median"] > 0.05
 
 
+def test_times_that_scatter_about_a_clock_change_no_error(tmp_path: Path) -> None:
+    root = write_capture(tmp_path / "capture", episodes=1)
+    right = evaluate_model(truth(), Capture.open(root), brief=True).result
+    (name,) = Capture.open(root).episodes("test")
+    tracks = Capture.open(root).tracks(name)
+    scatter = 2e-3 * np.random.default_rng(1).uniform(-1, 1, len(tracks["cube"].time_s))
+    late = {body: replace(track, time_s=track.time_s + scatter) for body, track in tracks.items()}
+    write_tracks(root / "tracks" / f"{name}.csv", late, overwrite=True)
+    found = evaluate_model(truth(), Capture.open(root), brief=True).result
+    assert any("follows the clock" in warning for warning in found.warnings)
+    assert found.translation_error_m.median == pytest.approx(right.translation_error_m.median, rel=0.1)
+
+
 def test_driven_body_follows_its_track(tmp_path: Path) -> None:
     """The tip pushes the resting cube; without its track the episode cannot be predicted."""
     root = write_capture(tmp_path / "capture", episodes=2)

@@ -285,7 +285,9 @@ def test_a_step_that_overshoots_is_damped_until_it_climbs() -> None:
     assert value == max(-10 * abs(one - 1.0) for one in tried) and abs(float(end[0]) - 1.0) < 0.35
 
 
-def component_choice(monkeypatch: pytest.MonkeyPatch, gains: tuple[float, float, float], share: float) -> Any:
+def component_choice(
+    monkeypatch: pytest.MonkeyPatch, gains: tuple[float, float, float], share: float, white: float = 100.0
+) -> Any:
     """Return what is chosen of white and fast noise, a slow process and a sway with given gains, and the starts."""
     log: list[tuple[int, tuple[str, ...], float]] = []
     found = {
@@ -302,6 +304,7 @@ def component_choice(monkeypatch: pytest.MonkeyPatch, gains: tuple[float, float,
         return found[tuple(kinds)]._replace(order=order), values[tuple(kinds)] - (order != ORDERS[0]) * 5
 
     monkeypatch.setattr(variance_components, "_climbed", climbed)
+    monkeypatch.setattr(variance_components, "_white", lambda _: white)
     contrasts: Any = SimpleNamespace(times_s=torch.tensor([[0.0, 0.3], [0.0, 0.5]], dtype=torch.float64))
     known = CorrelatedNoise(0.0, 0.01, 1.0)
     return variance_components.variance_components(contrasts, known, (0, 1)), log, known
@@ -323,6 +326,13 @@ def test_components_without_evidence_are_left_out(slow: bool, sway: bool, monkey
     kinds = [kind for _, kind, _ in log]
     assert kinds == [()] * len(ORDERS) + [("slow",), ("slow", "sway") if slow else ("sway",)]
     assert [order for _, _, order in log] == [*ORDERS, ORDERS[0], ORDERS[0]] and log[len(ORDERS)][0] >= 2
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_a_fast_process_that_flights_alone_show_is_kept(shown: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    white = 100 - variance_components.LIMITS.evidence / 2 - (1.0 if shown else -1.0)
+    (best, still, *_), _, known = component_choice(monkeypatch, (0.0, 0.0, 0.0), 0.6, white)
+    assert best is still and (best.share == 0.6 if shown else best is known)
 
 
 def test_layouts_do_not_depend_on_the_order_of_segments() -> None:

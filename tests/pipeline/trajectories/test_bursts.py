@@ -28,7 +28,10 @@ def found(world: object, episodes: Episodes) -> dict[tuple[int, int], list[int]]
     """Return the frames of bursts by kind and episode."""
     whole = whole_episodes(world, episodes)  # pyright: ignore[reportArgumentType]
     flight, _, _ = cut_episodes(world, whole, NOISE)  # pyright: ignore[reportArgumentType]
-    return {(kind, episode): frames.tolist() for kind in (0, 1) for episode, frames, _ in bursts(whole, flight, kind)}
+    noise = Noise(*NOISE)
+    return {
+        (kind, episode): frames.tolist() for kind in (0, 1) for episode, frames, _ in bursts(whole, flight, noise, kind)
+    }
 
 
 @pytest.mark.parametrize("first", [13, 27])
@@ -94,7 +97,7 @@ def test_a_burst_of_a_slide_is_left_out_and_where_it_stops_nothing_is(
         seen=seen,
         has_orientation=seen,
     )
-    left = without_grounded_bursts(slides, torch.zeros(2, 100, dtype=torch.bool))
+    left = without_grounded_bursts(slides, torch.zeros(2, 100, dtype=torch.bool), Noise(*NOISE))
     lost = (left.seen[..., 0] == 0).nonzero().tolist()
     if wrong is None:
         assert not lost

@@ -5,9 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.trajectories.frame_times import with_regular_times
+from cgwm.pipeline.trajectories.innovations import WHITE, CorrelatedNoise, NoiseModel, body_innovations
+from cgwm.pipeline.trajectories.time_errors import without_time_errors
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.diagnosis_data import world_with
 
@@ -86,10 +89,36 @@ def test_right_times_stay(bodies: set[str]) -> None:
         assert warnings == () and all(a is b for (_, a), (_, b) in zip(found, episodes, strict=True))
 
 
-def test_wrong_times_of_exposures_are_measured_and_said() -> None:
+def test_wrong_times_of_exposures_are_measured_and_said_and_part_of_the_noise() -> None:
+    """What is left of flights is of unit variance, and so are the numbers of an effect that is not there."""
     world = world_with("ball")
     prepared = prepare(world, throws(5, late), (None, None))
     assert prepared.time_error_s == pytest.approx(JITTER_S, rel=0.15)
+    assert prepared.noise.position_m == pytest.approx(NOISE_M, rel=0.2)
     assert any("0.5 ms" in text and "trigger the shutter" in text for text in prepared.warnings)
+    assert prepared.flight is not None
+    rows = prepared.flight.residuals([], world.gravity.new_zeros(0), jacobian=False)[0]
+    assert float(rows.square().sum() / prepared.flight.dof.sum()) == pytest.approx(1.0, abs=0.15)
     plain = prepare(world, throws(6, regular), Noise(NOISE_M, 0.01))
     assert plain.time_error_s == 0.0
+
+
+@pytest.mark.parametrize(
+    "memory",
+    [WHITE, NoiseModel(CorrelatedNoise(0.6, 0.02, 1.2, 1.5, 0.3, 30.0, order=1.5), CorrelatedNoise(0.5, 0.01))],
+)
+def test_residuals_without_errors_of_times_are_independent_and_of_unit_variance(memory: NoiseModel) -> None:
+    """The covariance is that of tracking plus s^2 of each frame's velocity and angular velocity, of two bodies."""
+    rng = torch.Generator().manual_seed(0)
+    frames, bodies, size = 7, 2, 7 * 2 * 6
+    times = torch.cumsum(0.002 + 0.01 * torch.rand(2, frames, generator=rng, dtype=torch.float64), 1)
+    masks = torch.ones(2, frames, bodies, 2, dtype=torch.float64)
+    masks[0, 3, 0, 0] = masks[1, -2:] = 0.0
+    shifts = torch.randn(2, frames, bodies, 6, generator=rng, dtype=torch.float64) * masks.repeat_interleave(3, -1)
+    unit = torch.eye(size, dtype=torch.float64).unflatten(0, (frames * bodies, 6)).expand(2, -1, -1, -1)
+    tracked = body_innovations(unit, times, masks, memory)
+    whitened = without_time_errors(tracked, shifts, times, masks, memory).reshape(2, size, size)
+    root = torch.linalg.inv(tracked.reshape(2, size, size))
+    moved = (shifts[..., None] * torch.eye(frames).to(shifts)[:, None, None]).reshape(2, size, frames)
+    covariance = root @ root.mT + moved @ moved.mT
+    torch.testing.assert_close(whitened @ covariance @ whitened.mT, torch.eye(size).to(shifts).expand(2, -1, -1))
