@@ -250,7 +250,7 @@ INLINE void roll(const Problem& problem, Place index, Lanes lanes, Environment& 
     env.geometry = index * problem.geometry_stride;
     env.surfaces = index * problem.surface_stride;
     env.drives = index * problem.drive_stride;
-#if DRIVEN
+#if !WIDE  // joints have commands, too, where no body is driven
     env.drive_last = index * problem.drive_last_stride;
 #endif
     lanes.sync();
