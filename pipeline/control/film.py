@@ -48,8 +48,17 @@ def film_of(found: TaskWorld, tables: RunTables, device: str) -> tuple[bytes | N
     name = found.world.body_names[found.object]
     if name not in found.model.body_splats or not len(tables.arrays["actions"]):
         return None, ""
+    return filmed(tables, _picture(found, tables, device))
+
+
+def filmed(tables: RunTables, draw: Callable[[int], tuple[Image, Image]]) -> tuple[bytes, str]:
+    """Return a film (WebM) of a run, and some of its frames as the URI of a picture.
+
+    Args:
+        tables: The run.
+        draw: Draws plant and prediction, each (H, W, 3), at the number of a command.
+    """
     frames = _frames(tables)
-    draw = _picture(found, tables, device)
     pictures = [draw(frame) for frame in frames]
     pairs = [np.concatenate(pair, axis=1) for pair in pictures]
     shown = evenly(len(frames), _SHEET)
@@ -82,15 +91,16 @@ def _picture(found: TaskWorld, tables: RunTables, device: str) -> Callable[[int]
     return pair
 
 
-def predicted_at(tables: RunTables, now_s: float) -> tuple[Array, Array] | None:
-    """Return pose (7,) of the object and x, y of the finger that a plan of a while before had predicted; None before.
+def predicted_at(tables: RunTables, now_s: float, ahead_s: float = AHEAD_S) -> tuple[Array, Array] | None:
+    """Return pose (7,) of the object and targets of the joints that a plan of a while before had; None before.
 
     Args:
         tables: The run.
         now_s: The time that was predicted [s].
+        ahead_s: Least age of the plan [s].
     """
     made = tables.arrays["plans/state_time"]
-    index = int((made <= now_s - AHEAD_S + 1e-9).sum()) - 1
+    index = int((made <= now_s - ahead_s + 1e-9).sum()) - 1
     if index < 0:
         return None
     times = tables.arrays["plans/times"][index]

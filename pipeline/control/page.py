@@ -46,7 +46,7 @@ def control_html(result: ControlResult, task: AnyTask, runs: Sequence[PageRun], 
         f'<p class="verdict">{text(result.sentence)}</p>',
         cautions([*result.warnings, *([result.advice] if result.advice else [])]),
         section("Runs", _table(result, runs)),
-        _film(result, webm, sheet),
+        _film(result, task, webm, sheet),
         section("Errors", *_errors(task, runs)),
         _joints(runs) if isinstance(task, HandTask) else section("Way of object and finger", *_ways(task, runs)),
         _times(result, task, runs),
@@ -73,14 +73,15 @@ def _table(result: ControlResult, runs: Sequence[PageRun]) -> str:
     return table(header, rows, numeric=(0, *range(2, len(header))), sorts=True)
 
 
-def _film(result: ControlResult, webm: bytes | None, sheet: str) -> str:
+def _film(result: ControlResult, task: AnyTask, webm: bytes | None, sheet: str) -> str:
     """Return the section with the film and some of its frames."""
     if result.video is None or webm is None:
         return ""
+    ahead = f"{min(AHEAD_S, task.planner.horizon_s):g} s before"
     told = (
-        f"Seed {result.runs[0].seed}: left, and above, the plant; right, and below, what a plan had predicted "
-        f"{AHEAD_S:g} s before. The cross is the goal."
+        f"Seed {result.runs[0].seed}: left, and above, the plant; right, and below, what a plan had predicted {ahead}"
     )
+    told += ", on the fingers as they were." if isinstance(task, HandTask) else ". The cross is the goal."
     picture = f'<img src="{sheet}" alt="plant and prediction, six moments" style="max-width:100%">'
     shown = film(webm, "plant beside prediction")
     return section("Plant and prediction", paragraph(told), shown, picture, facts([("film", way_link(FILM, FILM))]))

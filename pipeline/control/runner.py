@@ -14,6 +14,7 @@ from ..physics.world import World
 from .controller import Controller
 from .film import film_of
 from .hand_controller import HandController
+from .hand_film import hand_film_of
 from .hand_loop import goals_of, hand_errors, hand_start, run_hand
 from .hand_plant import HandModelPlant, HandPlant, HandScenePlant
 from .hand_tables import hand_tables_of
@@ -163,5 +164,5 @@ class HandRunner:
         return hand_errors(self.controller.task, truth, next(goals_of(self.controller.task, seed)))
 
     def film(self, tables: RunTables, device: str) -> tuple[bytes | None, str]:
-        """See :class:`Runner`; a hand has no film."""
-        return None, ""
+        """See :class:`Runner`."""
+        return hand_film_of(self.controller.hand, tables, device)

@@ -252,6 +252,7 @@ def test_the_verb_runs_a_hand_and_its_run_is_valid(folder: Path, model: Model, t
     assert (report.kind, report.faults) == ("run", ())
     page = (tmp_path / "run" / "control.html").read_text()
     assert "Joints" in page and ">swing" in page and "Contact force" not in page
+    assert "what a plan had predicted 0.4 s before" in page and result.video == "run.webm"
     recorded = read_runs(tmp_path / "run" / "run.h5")[0]
     assert recorded.joints == JOINTS and recorded.arrays["obs/joints"].shape == (6, 2)
 
