@@ -33,7 +33,7 @@ from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
 from ..segments.sliding_descent import WEAK
 from ..segments.sliding_fit import StartedSliding, nuisance_parameters
-from ..segments.sliding_residuals import finite_differences, soft_world
+from ..segments.sliding_residuals import LoadErrors, finite_differences, soft_world
 from ..segments.sliding_segments import find_sliding_segments
 from ..trajectories.segmentation import GroundPlane, cut_episodes, whole_episodes
 from .contact_tests.sliding import batches
@@ -68,24 +68,37 @@ class Channel:
     episodes: Array
     """Information of each episode of the data, (E, P, P): tests ask that held-out episodes are predicted."""
 
-    def noncentrality(self, information: Array, sizes: Array, variant: int, beside: int | None = None) -> Array:
+    def noncentrality(
+        self, information: Array, sizes: Array, variant: int, beside: Sequence[int] | None = None
+    ) -> Array:
         """Return the expected fall of chi2 (M,) by a missing effect of given sizes, averaged over its parameters.
 
         Args:
             information: Information of data and motions together, shape (M, P, P).
             sizes: Of the effect's parameters, one of which it has at a time, shape (k,).
             variant: Place of the effect.
-            beside: Place of another one that is fitted in its stead and may imitate it; None for none.
+            beside: Places of others, one of which is fitted in its stead and may imitate it: the smallest fall counts,
+                infinite without any; None for no other one.
         """
+        if beside is None:
+            return self._left(information, sizes, variant, np.empty((1, 0), dtype=np.int64)).min(1)
+        least = np.full(len(information), np.inf)
+        for width in {len(self.columns[other]) for other in beside}:
+            alike = np.array([self.columns[other] for other in beside if len(self.columns[other]) == width])
+            least = np.minimum(least, self._left(information, sizes, variant, alike).min(1))
+        return least
+
+    def _left(self, information: Array, sizes: Array, variant: int, beside: NDArray[np.int64]) -> Array:
+        """Return the falls (M, O) beside each of O others, whose columns are given (O, w)."""
         own = list(self.columns[variant])
-        others = [*range(self.base), *(self.columns[beside] if beside is not None else ())]
-        inner = information[:, others][:, :, others]
-        weak = np.diagonal(inner, axis1=1, axis2=2) * WEAK_SHARE + WEAK_SHARE
-        weak[:, : self.base] += self.prior
-        inner = inner + weak[:, :, None] * np.eye(len(others))
-        mixed = information[:, others][:, :, own]
-        left = information[:, own][:, :, own] - mixed.transpose(0, 2, 1) @ np.linalg.solve(inner, mixed)
-        return (np.diagonal(left, axis1=1, axis2=2) @ sizes**2 / len(own)).clip(0.0)
+        others = np.concatenate([np.tile(np.arange(self.base), (len(beside), 1)), beside], 1)
+        inner = information[:, others[:, :, None], others[:, None]]
+        weak = np.diagonal(inner, axis1=2, axis2=3) * WEAK_SHARE + WEAK_SHARE
+        weak[..., : self.base] += self.prior
+        inner = inner + weak[..., None] * np.eye(others.shape[1])
+        mixed = information[:, others][..., own]
+        left = information[:, None, own][..., own] - mixed.swapaxes(2, 3) @ np.linalg.solve(inner, mixed)
+        return (np.diagonal(left, axis1=2, axis2=3) @ sizes**2 / len(own)).clip(0.0)
 
 
 def contact_information(
@@ -210,14 +223,15 @@ def _eliminated(
     """Return the information (B, P, P) of sliding segments with their states eliminated, the known parameters first."""
     count = len(segments.items)
     columns: dict[int, Tensor] = {}
-    first = None
+    first, loads = None, LoadErrors.of(segments.in_world(soft))
     for part in batches(variants):
         extended, own = with_variants(soft, part, "contact")
         parameters = [*known, *own]
         every = torch.cat([values, torch.zeros(len(own)).to(values)]).expand(count, len(parameters))
-        # the nuisance parameters are the same in all parts
+        # the nuisance parameters and the states are the same in all parts
         asked = torch.arange(0 if first is None else len(known), len(parameters)).expand(count, -1)
-        found = finite_differences(segments.in_world(extended), parameters, every, asked)
+        own_segments = segments.in_world(extended)
+        found = finite_differences(own_segments, parameters, every, asked, loads, by_states=first is None)
         slopes = found.jacobian
         if first is None:
             first, slopes = found, slopes[..., len(known) :]

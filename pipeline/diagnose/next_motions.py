@@ -77,11 +77,8 @@ class Question:
                 full, rest = _needed(channel, self.variants[place])
                 # the others have to show it, too
                 enough = np.minimum(own[0] / full, own[1:].min(0) / rest)
-                left = np.full(len(more), math.inf)
-                for other, rival in enumerate(self.names):
-                    if rival != name and self._asked(name, rival):
-                        lead = channel.noncentrality(information[0], self.sizes[place], place, other)
-                        left = np.minimum(left, lead)
+                rivals = [k for k, rival in enumerate(self.names) if rival != name and self._asked(name, rival)]
+                left = channel.noncentrality(information[0], self.sizes[place], place, rivals)
                 better = enough > seen[place]
                 lead = np.minimum(left / _lead(channel), 1e6)
                 seen[place] = np.where(better, enough, seen[place])

@@ -130,6 +130,7 @@ def finite_differences(
     values: Tensor,
     free: Tensor,
     loads: LoadErrors | None = None,
+    by_states: bool = True,
 ) -> SlidingDifferences:
     """Return residuals of sliding segments with their derivatives by parameters and states.
 
@@ -139,8 +140,9 @@ def finite_differences(
         values: Of each segment (B, P), in fitted coordinates.
         free: Indices (B, S) of the parameters by which the first S derivatives are; -1 for a derivative of 0.
         loads: Model errors of the loads of the segments, where they are known.
+        by_states: Whether also by the states; otherwise the basis has no columns.
     """
-    basis = _basis(segments)
+    basis = _basis(segments)[..., slice(None) if by_states else slice(0)]
     k, (n, size) = basis.shape[-1], free.shape
     steps = torch.tensor([PARAMETER_STEP * p.prior[1] for p in parameters]).to(values)
     still = torch.zeros(n, STATE_SIZE).to(values)
