@@ -155,11 +155,16 @@ def within_cone(wanted: Tensor, slip: Tensor, cone: Tensor, slice_: Tensor) -> T
 
     The cone (n, 2, 2) is the symmetric matrix M of an ellipse; with M = mu it is Coulomb's disc.
     """
-    inverse = torch.linalg.inv(cone + 1e-9 * torch.eye(2).to(cone))
-    inside = (inverse @ wanted[..., None])[..., 0].norm(dim=-1) <= slice_
-    along = (cone @ slip[..., None])[..., 0]
-    most = -(cone @ along[..., None])[..., 0] / along.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    return torch.where(inside[:, None], wanted, slice_[:, None] * most)
+    # by elements, as an inverse of each of many small matrices takes five times as long
+    first, off, last = cone[:, 0, 0] + 1e-9, cone[:, 0, 1], cone[:, 1, 1] + 1e-9
+    (x, y), (u, v) = wanted.unbind(-1), slip.unbind(-1)
+    size2 = (last * x - off * y).square() + (first * y - off * x).square()
+    inside = size2.sqrt() <= slice_ * (first * last - off * off).abs()
+    first, last = cone[:, 0, 0], cone[:, 1, 1]
+    u, v = first * u + off * v, off * u + last * v
+    share = -slice_ / (u * u + v * v).sqrt().clamp_min(1e-12)
+    most = torch.stack([share * (first * u + off * v), share * (off * u + last * v)], -1)
+    return torch.where(inside[:, None], wanted, most)
 
 
 def _cone(touch: Touch) -> Tensor:
