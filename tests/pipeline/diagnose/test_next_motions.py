@@ -94,6 +94,26 @@ def test_the_motion_asked_for_shows_viscous_friction_better_than_most() -> None:
     assert aside[slides & (headings % 180 == 90)].min() > aside[slides & (headings % 180 == 0)].max()
 
 
+def test_of_the_rivals_of_an_effect_the_one_that_imitates_it_best_counts() -> None:
+    rows = np.random.default_rng(3).normal(size=(4, 12, 6))
+    motions = rows.transpose(0, 2, 1) @ rows
+    columns = ((1,), (2,), (3, 4), (5,))
+    channel = Channel(
+        name="sliding", base=1, columns=columns, prior=np.array([2.0]), data=motions[0], motions=motions, count=9,
+        episodes=motions[:0],
+    )  # fmt: skip
+
+    def fall(one: np.ndarray, others: list[int]) -> float:
+        inner = one[np.ix_(others, others)] + np.diag([2.0, *np.zeros(len(others) - 1)])
+        return 0.25 * float(one[1, 1] - one[1, others] @ np.linalg.solve(inner, one[others, 1]))
+
+    alone = channel.noncentrality(motions, np.array([0.5]), 0)
+    assert alone == pytest.approx([fall(one, [0]) for one in motions], rel=1e-6)
+    beside = channel.noncentrality(motions, np.array([0.5]), 0, [1, 2, 3])
+    assert beside == pytest.approx([min(fall(one, [0, *columns[k]]) for k in (1, 2, 3)) for one in motions], rel=1e-6)
+    assert np.isinf(channel.noncentrality(motions, np.array([0.5]), 0, [])).all()
+
+
 @pytest.mark.parametrize(("known", "asked"), [(1e9, 0), (0.0, 3)])
 def test_nothing_is_asked_for_where_everything_is_bounded(known: float, asked: int) -> None:
     world = world_with("cube")
