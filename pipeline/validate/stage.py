@@ -104,7 +104,7 @@ def validate_model(path: Path | str) -> ValidationReport:
         "scene_spheres": 0 if model.scene is None else len(model.scene),
         "stages": sorted(model.fit.stages),
         "parameters": {entry.name: f"{entry.estimate:.6g} {entry.unit}".strip() for entry in model.file.parameters},
-        "warnings": [*model.file.warnings, *model.fit.warnings],
+        "warnings": list(dict.fromkeys((*model.file.warnings, *model.fit.warnings))),
     }
     custom = [f"{effect.name} (SHA-256 {effect.sha256})" for effect in model.file.effects if effect.sha256]
     if custom:

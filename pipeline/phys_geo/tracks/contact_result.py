@@ -215,7 +215,7 @@ def _unseen_warning(unseen: Sequence[FittedParameter]) -> list[str]:
         return []
     if len(unseen) == 1:
         return [f"{unseen[0].name} is not observable in these data; {unseen[0].note}."]
-    notes = "; ".join(p.note.removesuffix(" would reveal it") for p in unseen)
+    notes = "; ".join(dict.fromkeys(p.note.removesuffix(" would reveal it") for p in unseen))
     return [f"{listed([p.name for p in unseen])} are not observable in these data; to reveal them: {notes}."]
 
 
