@@ -241,7 +241,7 @@ def _uses(cuda: tuple[str, ...], zstd: bool) -> dict[str, str]:
         "renderer": _renderer(bool(cuda)),
         "rollouts": _rollouts(),
         "threads": _threads(),
-        "photo_features": "COLMAP on the CPU, one thread (two runs agree bit for bit)",
+        "photo_features": "COLMAP on the CPU, all cores (two runs agree bit for bit)",
         "demo_renderer": "ray casting, no OpenGL",
         "compression": "zstd" if zstd else "none: --set synthesize.compression=gzip works without the filter",
     }
