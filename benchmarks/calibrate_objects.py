@@ -50,11 +50,11 @@ RIVALS = ("SIMPLE_RADIAL", "SIMPLE_PINHOLE", "RADIAL", "OPENCV")
 RIGHT_CENTRE_PERCENT, RIGHT_ROTATION_DEG = 0.3, 1.0
 
 
-def sessions(seed: int) -> Iterator[Session]:
-    """Yield the ways in which an object is photographed, with one seed."""
+def sessions(seed: int, count: int = PHOTOS) -> Iterator[Session]:
+    """Yield the ways in which an object is photographed, with one seed and a number of photos."""
     for number, (background, motion, focal, k1, gloss) in enumerate(LOOKS):
         yield Session(
-            count=PHOTOS,
+            count=count,
             focal_px=focal,
             k1=k1,
             motion=motion,  # type: ignore[arg-type]
@@ -194,7 +194,7 @@ def _said(row: dict[str, Any]) -> bool:
 def photos_of(ycb: Path, folder: Path, name: str, session: Session) -> tuple[Path, np.ndarray]:
     """Return the folder of an object's photos, made unless it is there, and the true poses (photo, 4, 4)."""
     painted = scanned(ycb / name)
-    made = (folder / f"{name}-{session.background}-{session.motion}-{session.seed}").resolve()
+    made = (folder / f"{name}-{session.background}-{session.motion}-{session.seed}-{session.count}").resolve()
     if not made.is_dir():
         new = Path(tempfile.mkdtemp(dir=made.parent)) / "photos"
         write_photos(new, photograph(painted, session)[0])
@@ -237,6 +237,7 @@ def main() -> int:
     parser.add_argument("ycb", type=Path)
     parser.add_argument("--objects", default=",".join(OBJECTS))
     parser.add_argument("--seeds", default="0")
+    parser.add_argument("--count", type=int, default=PHOTOS, help="photos of a set")
     parser.add_argument("--left-out", default="0", help="numbers of photos that are left out of each set")
     parser.add_argument("--photos", type=Path, default=Path("out/object-photos"), help="where the photos are kept")
     parser.add_argument("--contenders", default="cgwm,COLMAP")
@@ -250,7 +251,7 @@ def main() -> int:
         _key(name, session, seed, fewer): (arguments.ycb, arguments.photos, name, session, fewer)
         for seed in map(int, seeds)
         for name in names
-        for session in sessions(seed)
+        for session in sessions(seed, arguments.count)
         for fewer in map(int, left_out)
     }
     store.fill(measured, _in_order(sets, arguments.contenders.split(",")), arguments.workers)
@@ -261,6 +262,7 @@ def main() -> int:
 
 def _key(name: str, session: Session, seed: int, left_out: int) -> str:
     words = f"{name} {session.background} {session.motion} {seed}"
+    words += "" if session.count == PHOTOS else f" of {session.count}"
     return f"{words} without {left_out}" if left_out else words
 
 
@@ -271,7 +273,8 @@ def _in_order(sets: dict[str, Any], contenders: list[str]) -> dict[str, Any]:
     """
     keys = [list(sets)[k] for k in np.random.default_rng(0).permutation(len(sets))]
     pairs = [(key, one) for one in contenders for key in keys]
-    pairs.sort(key=lambda pair: (_late(*pair), "clutter" not in pair[0], pair[1] != "cgwm"))
+    # sets of which some photos are left out come when the photos of all are drawn
+    pairs.sort(key=lambda pair: (_late(*pair), "clutter" not in pair[0], pair[1] != "cgwm", " without " in pair[0]))
     return {f"{key} {one}": (*sets[key], one) for key, one in pairs}
 
 

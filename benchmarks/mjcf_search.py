@@ -5,7 +5,7 @@ damping ratio of solref and of solreffriction, the five numbers of solimp, impra
 elliptic. What is minimised is the median deviation 0.1 s after the first contact over some throws (`mjcf_contacts`);
 the best setting is then judged on other throws, beside the export as it is. Run with
 
-    python benchmarks/mjcf_search.py [--laws 1,3] [--workers 8] [--seconds 500]
+    python benchmarks/mjcf_search.py [--laws 1,3] [--workers 8] [--generations 10]
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import json
 import multiprocessing
 import os
 import sys
-import time
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -40,8 +39,8 @@ NUMBERS: dict[str, tuple[float, float, bool]] = {
 }
 """Least and largest value of each number, and whether it is searched by its logarithm."""
 AS_EXPORTED = (1.0, 1.0, 0.99, 0.99, 0.001, 0.5, 2.0, 1.0, 1.0, 1.0, 1.0)
-POPULATION, ELITE, SMOOTHED = 48, 10, 0.3
-FITTED, JUDGED = range(5000, 5120), range(6000, 6100)
+POPULATION, ELITE, SMOOTHED, SPREAD = 48, 10, 0.3, 0.15
+FITTED, JUDGED = range(5000, 5080), range(6000, 6100)
 """Seeds of the throws on which numbers are searched, and of those on which they are judged."""
 
 
@@ -112,15 +111,14 @@ def _work(job: tuple[int, range, np.ndarray]) -> tuple[float, float, float]:
     return deviation(law, seeds.start, len(seeds), values)
 
 
-def search(law: int, pool: Any, until: float, seed: int = 0) -> dict[str, Any]:
-    """Return the best numbers that are found for a law before a time [s] of the clock, judged on other throws."""
+def search(law: int, pool: Any, generations: int, seed: int = 0) -> dict[str, Any]:
+    """Return the best numbers that some generations find for a law, judged on other throws."""
     rng = np.random.default_rng(seed)
-    mean, std = point_of(np.array(AS_EXPORTED)), np.full(len(NUMBERS), 0.25)
-    best, best_mm, tried = np.array(AS_EXPORTED), np.inf, 0
-    generations = 0
-    while time.monotonic() < until:
+    mean, std = point_of(np.array(AS_EXPORTED)), np.full(len(NUMBERS), SPREAD)
+    best, best_mm = np.array(AS_EXPORTED), np.inf
+    for generation in range(generations):
         points = rng.normal(mean, std, (POPULATION, len(mean))).clip(0, 1)
-        if generations == 0:
+        if generation == 0:
             points[0] = mean
         medians = np.array([one[0] for one in pool.map(_work, [(law, FITTED, values_of(p)) for p in points], 1)])
         order = np.argsort(medians)
@@ -129,19 +127,14 @@ def search(law: int, pool: Any, until: float, seed: int = 0) -> dict[str, Any]:
         elite = points[order[:ELITE]]
         mean = SMOOTHED * mean + (1 - SMOOTHED) * elite.mean(0)
         std = SMOOTHED * std + (1 - SMOOTHED) * elite.std(0) + 0.005
-        tried, generations = tried + len(points), generations + 1
-        print(
-            law,
-            generations,
-            f"best {best_mm:.2f} mm, mean of the elite {medians[order[:ELITE]].mean():.2f}",
-            flush=True,
-        )
+        middle_mm = medians[order[:ELITE]].mean()
+        print(law, generation, f"best {best_mm:.2f} mm, mean of the elite {middle_mm:.2f}", flush=True)
     candidates = {"exported": np.array(AS_EXPORTED), "best": best, "mean": values_of(mean)}
     judged = pool.map(_work, [(law, JUDGED, values) for values in candidates.values()], 1)
     friction, contact_time_s, damping = LAWS[law]
     return {
         "key": f"friction {friction:g}, contact time {1e3 * contact_time_s:g} ms, damping {damping:g}",
-        "settings": tried,
+        "settings": POPULATION * generations,
         "searched_mm": round(best_mm, 2),
         "judged_mm_90_deg": {name: [round(v, 2) for v in one] for name, one in zip(candidates, judged, strict=True)},
         "best": dict(zip(NUMBERS, (float(f"{value:.4g}") for value in best), strict=True)),
@@ -154,15 +147,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--laws", default="1,3", help="places in mjcf_contacts.LAWS")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=500.0)
+    parser.add_argument("--generations", type=int, default=10)
     given = parser.parse_args()
     laws = [int(law) for law in given.laws.split(",")]
-    begun = time.monotonic()
     os.environ["OMP_NUM_THREADS"] = "1"
     with multiprocessing.get_context("spawn").Pool(given.workers) as pool:
-        for k, law in enumerate(laws):
-            until = begun + 0.93 * given.seconds * (k + 1) / len(laws)
-            print(json.dumps(search(law, pool, until)), flush=True)
+        for law in laws:
+            print(json.dumps(search(law, pool, given.generations)), flush=True)
     return 0
 
 

@@ -7,6 +7,7 @@ of the sensor and JPEG. A turntable turns the object before a camera that stands
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -117,17 +118,8 @@ def _shaded(
 
 def _table(session: Session, mesh: Mesh, place: Array) -> NDArray[np.float32]:
     """Return a patterned table with printed cards that stand on it, as the ideal camera at `place` (4, 4) sees them."""
-    rng = np.random.default_rng([session.seed, 3])
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    size, ground = float(np.linalg.norm(high - low)), np.array([*(0.5 * (low + high))[:2], low[2]])
-    cards = [(ground - [1.6 * size, 1.6 * size, 0], np.array([3.2 * size, 0, 0]), np.array([0, 3.2 * size, 0]))]
-    for _ in range(_CARDS):
-        angle, reach, turn = rng.uniform(0, 2 * np.pi), rng.uniform(0.9, 1.5) * size, rng.uniform(0, np.pi)
-        wide, tall = rng.uniform(0.3, 0.6) * size, rng.uniform(0.2, 0.5) * size
-        along = wide * np.array([np.cos(turn), np.sin(turn), 0])
-        foot = ground + reach * np.array([np.cos(angle), np.sin(angle), 0]) - 0.5 * along
-        cards.append((foot, along, np.array([0, 0, tall])))
-    patterns = [_pattern(rng) for _ in cards]
+    cards, patterns = _cards(session.seed, float(np.linalg.norm(high - low)), *(0.5 * (low + high))[:2], low[2])
     pose = np.linalg.inv(place)
     far = [-float((pose[:3, :3] @ (corner + 0.5 * (u + v)) + pose[:3, 3])[2]) for corner, u, v in cards]
     image = np.full((HEIGHT, WIDTH, 3), 0.35, np.float32)
@@ -142,6 +134,23 @@ def _table(session: Session, mesh: Mesh, place: Array) -> NDArray[np.float32]:
         drawn = cv2.warpPerspective(patterns[k], homography, (WIDTH, HEIGHT), flags=cv2.INTER_AREA)
         image = np.where(cover[..., None] > 0.5, drawn, image)
     return image
+
+
+@lru_cache(maxsize=1)
+def _cards(
+    seed: int, size: float, x: float, y: float, z: float
+) -> tuple[list[tuple[Array, Array, Array]], list[NDArray[np.float32]]]:
+    """Return the corner and the sides of the table and of each card, and their patterns; the same in all photos."""
+    rng, ground = np.random.default_rng([seed, 3]), np.array([x, y, z])
+    cards = [(ground - [1.6 * size, 1.6 * size, 0], np.array([3.2 * size, 0, 0]), np.array([0, 3.2 * size, 0]))]
+    for _ in range(_CARDS):
+        angle, reach, turn = rng.uniform(0, 2 * np.pi), rng.uniform(0.9, 1.5) * size, rng.uniform(0, np.pi)
+        wide, tall = rng.uniform(0.3, 0.6) * size, rng.uniform(0.2, 0.5) * size
+        along = wide * np.array([np.cos(turn), np.sin(turn), 0])
+        foot = ground + reach * np.array([np.cos(angle), np.sin(angle), 0]) - 0.5 * along
+        cards.append((foot, along, np.array([0, 0, tall])))
+    patterns = [_pattern(rng) for _ in cards]
+    return cards, patterns
 
 
 def _pattern(rng: np.random.Generator) -> NDArray[np.float32]:
