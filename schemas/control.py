@@ -312,7 +312,9 @@ class ControlRun(FileModel):
     plan_cpu_ms: Milliseconds
     """Median time of all processors for a plan [ms]."""
     largest_force_n: Annotated[float, Field(ge=0, le=1e12)]
-    """Largest contact force of the finger on the object, mean over the interval of a command [N]."""
+    """Largest contact force of the finger on the object; of a hand, sum of the sizes of all contact forces on it; means
+    over the interval of a command [N].
+    """
 
 
 class ControlResult(FileModel):

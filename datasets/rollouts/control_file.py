@@ -79,6 +79,7 @@ HAND_COMMANDS: Mapping[str, RunArray] = {
     "control/target": _array(("J",), "rad", "Targets of the joints at the end of the command."),
     "control/position_error": COMMANDS["control/position_error"],
     "control/turn_error": COMMANDS["control/turn_error"],
+    "control/grip": _array((), "N", "Sum of the sizes of the contact forces on the object, mean over the command."),
     "control/reached": _array((), "1", "1 where the goal was reached by this command."),
 }
 """The same of a hand with J joints; S = 14 + 2 J."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -37,13 +38,17 @@ class Elites:
         pieces, joints = objective.shape
         size = np.array([self.noise[0], *[self.noise[1]] * (self.nodes - 1)])[:, None]
         nodes = objective.bound * size * rng.normal(size=(self.samples - 1, self.nodes, joints))
-        changes = torch.einsum("kn,snj->skj", self._polynomials(pieces).to(warm), torch.as_tensor(nodes).to(warm))
+        changes = torch.einsum(
+            "kn,snj->skj", _polynomials(pieces, self.nodes).to(warm), torch.as_tensor(nodes).to(warm)
+        )
         values = torch.cat((warm[None], warm + changes)).clamp(-objective.bound, objective.bound)
         costs = objective.costs(values)
         order = costs.argsort()[: self.best]
         return Solution(values[order].mean(0), float(costs[order[0]]))
 
-    def _polynomials(self, pieces: int) -> Tensor:
-        """Return the values at the ends of pieces (pieces, nodes) of the polynomials that are 1 at one node."""
-        ends, nodes = np.arange(1, pieces + 1) / pieces, np.linspace(0, 1, self.nodes)
-        return torch.as_tensor(np.vander(ends, self.nodes) @ np.linalg.inv(np.vander(nodes)))
+
+@cache
+def _polynomials(pieces: int, nodes: int) -> Tensor:
+    """Return the values at the ends of pieces (pieces, nodes) of the polynomials that are 1 at one of some nodes."""
+    ends, places = np.arange(1, pieces + 1) / pieces, np.linspace(0, 1, nodes)
+    return torch.as_tensor(np.vander(ends, nodes) @ np.linalg.inv(np.vander(places)))

@@ -137,6 +137,7 @@ def _note_command(
         next_quat_wxyz=after.quat_wxyz,
         next_joints=after.joints_rad,
         goal_wxyz=goal_wxyz,
+        grip_n=after.grip_n,
         position_error_m=outcome[0],
         turn_error_deg=outcome[1],
         reached=outcome[2],

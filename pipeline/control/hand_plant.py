@@ -38,6 +38,8 @@ class HandTruth:
     """Values of the joints [rad], shape (joints,)."""
     speeds_rad_s: Array
     """Their speeds [rad/s], shape (joints,)."""
+    grip_n: float = 0.0
+    """Sum of the sizes of the contact forces on the object, mean over the last interval [N]."""
 
     @property
     def finite(self) -> bool:
@@ -99,15 +101,17 @@ class HandModelPlant:
         knots = torch.as_tensor(np.stack((self._target, target_rad)))[None]
         command = {self._hand.chain.name: JointCommand.targets(times, knots)}
         assert self._state is not None  # the runner resets first
-        found = rollout(self._world, self._state, times[0], command)
+        found = rollout(self._world, self._state, times[0], command, record_contacts=True)
         motion = (found.position_m, found.quat_wxyz, found.velocity_m_s, found.omega_body_rad_s)
         self._state, self._target = State(*(values[:, -1] for values in motion)), np.asarray(target_rad, float)
-        truth = self._truth()
+        assert found.contacts is not None  # they were asked for
+        ours = (found.contacts.body_a == self._hand.object) | (found.contacts.body_b == self._hand.object)
+        truth = self._truth(float(found.contacts.impulse_n_s[0, -1, ours].norm(dim=-1).sum()) / interval_s)
         if not truth.finite:
             raise NotConvergedError("the plant diverged.", todo="take a model with a smaller step_s.")
         return truth
 
-    def _truth(self) -> HandTruth:
+    def _truth(self, grip_n: float = 0.0) -> HandTruth:
         assert self._state is not None
         position, quat, velocity, omega = (part[0, self._hand.object].numpy().copy() for part in self._state.tensors)
         joints, speeds = joints_of(self._world, self._state, self._hand.chain, exact=False)
@@ -119,6 +123,7 @@ class HandModelPlant:
             names=self._hand.joints,
             joints_rad=joints[0].numpy().copy(),
             speeds_rad_s=speeds[0].numpy().copy(),
+            grip_n=grip_n,
         )
 
 
@@ -162,14 +167,25 @@ class HandScenePlant:
         data, model = self._data, self._model
         servos = [servo for _, _, servo in self._places]
         steps = max(1, round(interval_s / model.opt.timestep))
-        first = data.ctrl[servos].copy()
+        first, grip = data.ctrl[servos].copy(), 0.0
         for step in range(1, steps + 1):
             data.ctrl[servos] = first + (np.asarray(target_rad) - first) * step / steps
             self._mujoco.mj_step(model, data)
-        found = self._truth()
+            grip += self._grip() / steps
+        found = self._truth(grip)
         if not found.finite:
             raise NotConvergedError("the plant in MuJoCo diverged.", todo="take a smaller timestep in the scene.")
         return found
+
+    def _grip(self) -> float:
+        """Return the sum of the sizes of the contact forces on the object at this step [N]."""
+        first, wrench, total = self._model.body_geomadr[self._body], np.zeros(6), 0.0
+        geoms = self._data.contact.geom - first
+        ours = ((geoms >= 0) & (geoms < self._model.body_geomnum[self._body])).any(1)
+        for number in np.flatnonzero(ours):
+            self._mujoco.mj_contactForce(self._model, self._data, number, wrench)
+            total += float(np.linalg.norm(wrench[:3]))
+        return total
 
     def _object(self, task: HandTask, path: str) -> int:
         """Return the number of the object's body."""
@@ -217,7 +233,7 @@ class HandScenePlant:
             model.geom_pos[geoms] *= plant.size_factor
             model.geom_rbound[geoms] *= plant.size_factor
 
-    def _truth(self) -> HandTruth:
+    def _truth(self, grip_n: float = 0.0) -> HandTruth:
         model, data = self._model, self._data
         joint = model.body_jntadr[self._body]
         place, speed = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
@@ -229,4 +245,5 @@ class HandScenePlant:
             names=self._hand.joints,
             joints_rad=data.qpos[[place for place, _, _ in self._places]].copy(),
             speeds_rad_s=data.qvel[[speed for _, speed, _ in self._places]].copy(),
+            grip_n=grip_n,
         )

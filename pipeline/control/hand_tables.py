@@ -47,6 +47,7 @@ def hand_tables_of(recording: Recording, controller: HandController, timed: bool
         "control/target": commands("target", count),
         "control/position_error": errors[0],
         "control/turn_error": errors[1],
+        "control/grip": commands("grip_n"),
         "control/reached": commands("reached").astype(np.uint8),
         **plan_arrays(recording, task.planner.knots, count, timed),
     }

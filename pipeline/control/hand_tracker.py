@@ -100,12 +100,16 @@ class HandTracker:
             state: The measured state.
             sent: The targets that the joints had since the state before; None where they are unknown.
         """
+        if not (self._noise.any() or self._worlds.draws > 1 or state.velocity_m_s is None or
+                state.omega_body_rad_s is None):  # fmt: skip
+            self._known = None
+            quat = np.asarray(state.quat_wxyz, float) / np.linalg.norm(state.quat_wxyz)
+            given = state.velocity_m_s, state.omega_body_rad_s, state.joint_speeds
+            return self._hand.state(state.position_m, quat, state.joints, *given)
         before, found = self._known, self._measured(state)
         gone = math.inf if before is None else state.time_s - before.time_s
-        unknown = state.velocity_m_s is None or state.omega_body_rad_s is None
         if before is not None and sent is not None and 0 < gone <= LONGEST_S:
-            if unknown or self._noise.any() or self._worlds.draws > 1:
-                found = self._corrected(before, found, state, sent)
+            found = self._corrected(before, found, state, sent)
         self._known = found
         place, turn, velocity, omega = (part[0].numpy() for part in found.mean)
         return self._hand.state(place, turn, found.joints, velocity, omega, found.speeds)

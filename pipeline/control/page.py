@@ -50,7 +50,7 @@ def control_html(result: ControlResult, task: AnyTask, runs: Sequence[PageRun], 
         section("Errors", *_errors(task, runs)),
         _joints(runs) if isinstance(task, HandTask) else section("Way of object and finger", *_ways(task, runs)),
         _times(result, task, runs),
-        "" if isinstance(task, HandTask) else section("Contact force", *_forces(runs)),
+        section("Contact force", *_forces(runs)),
         section("What was asked for", _asked(result)),
     ]
     return page(f"cgwm control: {Path(result.task).name}", [piece for piece in body if piece])
@@ -61,13 +61,13 @@ def _table(result: ControlResult, runs: Sequence[PageRun]) -> str:
     real = result.clock == "real"
     hand = any("obs/joints" in run.tables.arrays for run in runs)
     header = ["seed", "ended", "time [s]", "position error [mm]", "turn error [deg]", "commands"]
-    header += ["goals"] if hand else ["largest force [N]"]
+    header += [*(["goals"] if hand else []), "largest force [N]"]
     header += ["late plans", "plan, median [ms]", "plan, 95 % [ms]"] if real else []
     rows = []
     for run in result.runs:
         row = [str(run.seed), run.ended.replace("_", " "), fixed(run.time_s), fixed(run.position_error_m, 1, 1e3)]
         row += [fixed(run.turn_error_deg), str(run.commands)]
-        row += [str(run.goals)] if hand else [number(run.largest_force_n)]
+        row += [*([str(run.goals)] if hand else []), number(run.largest_force_n)]
         row += [f"{run.late_plans} of {run.plans}", fixed(run.plan_ms), fixed(run.plan_ms_95)] if real else []
         rows.append(row)
     return table(header, rows, numeric=(0, *range(2, len(header))), sorts=True)
@@ -172,12 +172,14 @@ def _times(result: ControlResult, task: AnyTask, runs: Sequence[PageRun]) -> str
 
 def _forces(runs: Sequence[PageRun]) -> list[str]:
     """Return the contact force over time."""
-    lines = []
+    lines, hand = [], "control/grip" in runs[0].tables.arrays
     for index, run in enumerate(runs[:MOST_LINES]):
-        force = np.linalg.norm(run.tables.arrays["control/force"], axis=-1)
+        arrays = run.tables.arrays
+        force = arrays["control/grip"] if hand else np.linalg.norm(arrays["control/force"], axis=-1)
         points = _thinned(run.tables.arrays["control/time"], force)
         lines.append(Series(name=f"seed {run.figures.seed}", points=points, color=f"m{index % 6}"))
-    told = paragraph("Of the finger on the object, mean over a command.")
+    told = "Sum of the sizes of all forces on the object" if hand else "Of the finger on the object"
+    told = paragraph(f"{told}, mean over a command.")
     return [told, plot_svg(Plot(title="Force [N]", x="time [s]", series=lines, zero=True)), legend(lines)]
 
 

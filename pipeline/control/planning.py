@@ -177,7 +177,7 @@ class PlanningController(ABC):
             state_s: Time of the state.
             acts_s: Time from which the next plan acts.
         """
-        sent = [(time, target) for time, target in self._sent if time < acts_s + 1e-9]
+        sent = self._sent_from(state_s, acts_s)
         if not sent:
             times = np.array([state_s, acts_s] if acts_s > state_s + 1e-9 else [state_s])
             return Targets(times_s=times, values_m=before.at(times))
@@ -186,6 +186,16 @@ class PlanningController(ABC):
         times = np.array([state_s, *inner, acts_s] if acts_s > state_s + 1e-9 else [state_s])
         later = times > known.times_s[-1] + 1e-9
         return Targets(times_s=times, values_m=np.where(later[:, None], before.at(times), known.at(times)))
+
+    def _sent_from(self, first_s: float, last_s: float) -> list[tuple[float, Array]]:
+        """Return the targets that were sent until a time [s], from the last ones before another time on."""
+        found = []
+        for time_s, target in reversed(self._sent):
+            if time_s < last_s + 1e-9:
+                found.append((time_s, target))
+            if time_s <= first_s:
+                break
+        return found[::-1]
 
     def command(self, state: ControlState | None, now_s: float | None = None) -> dict[str, float]:
         """Return the targets of the joints at the end of the next command's interval, by joint name [m, rad].

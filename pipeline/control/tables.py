@@ -87,7 +87,7 @@ def figures_of(recording: Recording, tables: RunTables, start: tuple[float, floa
     wall, cpu = (1e3 * recording.column(name, "plans") for name in ("wall_s", "cpu_s"))
     errors = (arrays["control/position_error"], arrays["control/turn_error"])
     last = tuple(float(values[-1]) if len(values) else first for values, first in zip(errors, start, strict=True))
-    force = np.linalg.norm(arrays.get("control/force", np.zeros((0, 3))), axis=-1)
+    force = arrays["control/grip"] if "control/grip" in arrays else np.linalg.norm(arrays["control/force"], axis=-1)
     return ControlRun(
         seed=recording.seed,
         ended=recording.ended,

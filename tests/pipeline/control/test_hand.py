@@ -227,6 +227,10 @@ def test_both_plants_move_the_joint_that_is_commanded(controller: HandController
         after = plant.advance(np.array([-0.5, 0.0]), 0.05)  # away from the cube
     assert after.joints_rad[0] < -0.2 and abs(after.joints_rad[1]) < 0.05
     assert np.linalg.norm(after.position_m - before.position_m) < 0.003
+    weight = after.grip_n / 9.81  # on the palm
+    assert weight == pytest.approx(
+        0.2 if kind is HandScenePlant else float(controller.hand.world.bodies[-1].mass), rel=0.02
+    )
 
 
 def test_a_run_ends_at_its_time_or_when_the_object_is_dropped(controller: HandController) -> None:
@@ -251,7 +255,7 @@ def test_the_verb_runs_a_hand_and_its_run_is_valid(folder: Path, model: Model, t
     report = validate(tmp_path / "run")
     assert (report.kind, report.faults) == ("run", ())
     page = (tmp_path / "run" / "control.html").read_text()
-    assert "Joints" in page and ">swing" in page and "Contact force" not in page
+    assert "Joints" in page and ">swing" in page and "Sum of the sizes of all forces" in page
     assert "what a plan had predicted 0.4 s before" in page and result.video == "run.webm"
     recorded = read_runs(tmp_path / "run" / "run.h5")[0]
     assert recorded.joints == JOINTS and recorded.arrays["obs/joints"].shape == (6, 2)
