@@ -113,6 +113,19 @@ def test_diagnose_reaches_few_modules() -> None:
     assert len(import_graph.reach(import_edges(), "cli.diagnose")) <= 172
 
 
+def test_every_message_to_a_user_says_what_to_do_next() -> None:
+    spoken = {"InputDataError", "UsageError", "NotConvergedError", "NotEnoughMemoryError", "NotEnoughSpaceError"}
+    wrong = [
+        place(path, call.lineno)
+        for path in FILES
+        for call in nodes(path)
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in spoken
+        if len(call.args) < 3 and not any(isinstance(one, ast.Starred) for one in call.args)
+        if "todo" not in {word.arg for word in call.keywords}
+    ]
+    assert wrong == []
+
+
 def test_the_rooms_import_each_other_relatively() -> None:
     # "import datasets" would find another package of that name in many environments.
     wrong = [

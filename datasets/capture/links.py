@@ -120,6 +120,7 @@ def _body(root: Path, entry: Entry, link: LinkOfRobot, first: bool) -> Body:
         raise InputDataError(
             f"{root / entry.path}: link '{link.name}': {told['msg'].removeprefix('Value error, ')}.",
             "a name of letters, digits, _ . -, a mass [kg], and an inertia [kg m2] that a body can have.",
+            todo="correct the link in the URDF.",
         ) from None
 
 

@@ -37,8 +37,16 @@ def read_tensor(file: Path, columns: int, *, batched: bool = False) -> NDArray[n
     if not isinstance(tensor, torch.Tensor) or tensor.shape[-1:] != (columns,) or tensor.dim() not in dimensions:
         shape = tuple(tensor.shape) if isinstance(tensor, torch.Tensor) else type(tensor).__name__
         wanted = f"(1, T, {columns})" if batched else f"(T, {columns})"
-        raise InputDataError(f"{file}: {shape} where a toss was expected.", f"a tensor {wanted}.")
+        raise InputDataError(
+            f"{file}: {shape} where a toss was expected.",
+            f"a tensor {wanted}.",
+            todo="save each toss as one tensor of this shape with torch.save.",
+        )
     if tensor.numel() > MOST_NUMBERS or tensor.is_complex():  # a tensor may repeat few numbers without end
         found = f"{file}: {tensor.numel()} numbers, {tensor.dtype}."
-        raise InputDataError(found, f"at most {MOST_NUMBERS} real numbers.")
+        raise InputDataError(
+            found,
+            f"at most {MOST_NUMBERS} real numbers.",
+            todo="save each toss as one tensor of real numbers with torch.save.",
+        )
     return tensor.reshape(-1, columns).numpy().astype(np.float64)

@@ -207,7 +207,11 @@ def amodal_dtype(bodies: int) -> np.dtype[Any]:
     for dtype in (np.uint8, np.uint16, np.uint32, np.uint64):
         if bodies <= 8 * np.dtype(dtype).itemsize:
             return np.dtype(dtype)
-    raise InputDataError(f"{bodies} bodies: their amodal masks have a bit for each.", f"up to {MOST_BODIES} bodies.")
+    raise InputDataError(
+        f"{bodies} bodies: their amodal masks have a bit for each.",
+        f"up to {MOST_BODIES} bodies.",
+        todo="synthesize fewer bodies in one scene.",
+    )
 
 
 def open_shard(path: Path, cache_bytes: int = 16 << 20) -> h5py.File:
@@ -265,7 +269,11 @@ def _shard_files(path: Path, shards: Node) -> list[str]:
     names = [name.decode() for name in shards["file"][()].tolist()]
     strange = next((name for name in names if not SHARD.fullmatch(PurePosixPath(name).name)), None)
     if strange is not None:
-        raise InputDataError(f"{path}: an index that looks into {strange!a:.80}.", "rollouts-<i>-of-<n>.h5.")
+        raise InputDataError(
+            f"{path}: an index that looks into {strange!a:.80}.",
+            "rollouts-<i>-of-<n>.h5.",
+            todo="copy the whole dataset, or run 'cgwm validate' on it.",
+        )
     return names
 
 
@@ -336,7 +344,11 @@ def _require_sizes(demo: Node, path: Path, name: str) -> None:
     frames, count = demo["time"].shape, demo.attrs["num_samples"]
     if not isinstance(count, int | np.integer) or frames != (count,):
         where = f"{path}: data/{name}/time"
-        raise InputDataError(f"{where}: shape {frames}; num_samples says {count!s:.40}.", "as many frames.")
+        raise InputDataError(
+            f"{where}: shape {frames}; num_samples says {count!s:.40}.",
+            "as many frames.",
+            todo="copy the file again, or run 'cgwm validate' on the dataset.",
+        )
     for camera, entry in demo["cameras"].items() if "cameras" in demo else ():
         size = tuple(int(entry[key][()]) for key in ("height", "width"))
         for kind in ("image", "depth", "mask", "amodal"):
@@ -348,4 +360,5 @@ def _require_sizes(demo: Node, path: Path, name: str) -> None:
                     f"{path}, {name}: obs/{camera}_{kind}: its shape is {item.shape}; {axes} is documented, here "
                     f"{wanted}.",
                     "images of the size of their camera.",
+                    todo="copy the file again, or run 'cgwm validate' on the dataset.",
                 )

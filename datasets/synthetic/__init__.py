@@ -75,6 +75,7 @@ def make_scene(
         raise UsageError(
             f"{photos} photos of {photo_size[0]}x{photo_size[1]} px, videos of {video_size[0]}x{video_size[1]} px.",
             "at least 3 photos, and sides of at least 16 px.",
+            todo="ask for more photos, or for larger ones.",
         )
     with new_directory(Path(out), "capture", overwrite) as directory:
         plan = plan_scene(name, seed)

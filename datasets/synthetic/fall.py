@@ -84,7 +84,9 @@ def _toss(
             if useful[-1][0] < _PREDICTABLE or len(useful) == _CANDIDATES:
                 break
     if not useful:
-        raise NotConvergedError(f"scene fall: none of {_TRIES} tosses of the {solid.family} stays in view.")
+        raise NotConvergedError(
+            f"scene fall: none of {_TRIES} tosses of the {solid.family} stays in view.", todo="choose another seed."
+        )
     return min(useful, key=lambda one: one[0])[1]
 
 

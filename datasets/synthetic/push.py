@@ -73,7 +73,9 @@ def _push(rng: np.random.Generator, seed: int, model: MjModel, solid: SolidObjec
         motion = simulate(model, qpos, np.zeros(6), -_SETTLING_S, duration, command)
         if _visible(motion) and _upright(motion) and stays_in_view(solid, motion, cameras):
             return motion
-    raise NotConvergedError(f"scene push: none of {_TRIES} pushes of the {solid.family} moves it as wanted.")
+    raise NotConvergedError(
+        f"scene push: none of {_TRIES} pushes of the {solid.family} moves it as wanted.", todo="choose another seed."
+    )
 
 
 def _path(rng: np.random.Generator, solid: SolidObject, qpos: Array, direction: Array, bends: bool) -> Array:

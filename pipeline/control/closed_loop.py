@@ -93,13 +93,16 @@ class ClosedLoop:
         dtype: torch.dtype = torch.float64,
     ) -> None:
         if not 0 < control_dt_s < float("inf"):
-            raise UsageError(f"a control interval of {control_dt_s:g} s.", "above 0 s.")
+            raise UsageError(
+                f"a control interval of {control_dt_s:g} s.", "above 0 s.", todo="give control_dt_s above 0."
+            )
         driven = next((one for one in model.file.articulations if one.base == "driven"), None)
         if driven is not None:
             raise UsageError(
                 f"{model.place}: the root '{driven.root}' of the jointed body '{driven.name}' is driven, and "
                 "ClosedLoop moves driven bodies without joints alone.",
                 'jointed bodies with base = "free" or "fixed".',
+                todo="leave the driven root to a track, or make it free or fixed in the capture and fit again.",
             )
         self._times = torch.tensor([[0.0, control_dt_s]], dtype=torch.float64)
         self._cuda = torch.device(device).type == "cuda"
@@ -133,7 +136,11 @@ class ClosedLoop:
         for name, size in SIZES.items():
             shape = tuple(getattr(state, name).shape)
             if shape != (1, count, size):
-                raise InputDataError(f"the start's {name} has the shape {shape}.", f"{(1, count, size)}.")
+                raise InputDataError(
+                    f"the start's {name} has the shape {shape}.",
+                    f"{(1, count, size)}.",
+                    todo="give states of this shape, as State of the world makes them.",
+                )
         start = State(*(value.detach().to(world.gravity) for value in state.tensors))
         start = replace(start, quat_wxyz=quat_normalize(start.quat_wxyz))
         pose = (start.position_m.to("cpu", torch.float64), start.quat_wxyz.to("cpu", torch.float64))
@@ -206,13 +213,19 @@ class ClosedLoop:
         if set(command) != set(poses):
             wrong = sorted(set(command) ^ set(poses))[0]
             found = f"a command for '{wrong}', which is not driven" if wrong in command else f"no command for '{wrong}'"
-            raise UsageError(f"{found}.", f"one for each of: {', '.join(poses) or 'no body'}.")
+            raise UsageError(
+                f"{found}.",
+                f"one for each of: {', '.join(poses) or 'no body'}.",
+                todo="give one command for each body that is driven or has joints, by its name.",
+            )
         drives = {}
         for name, (position, quat) in poses.items():
             wanted = command[name]
             if isinstance(wanted, Targets):
                 raise UsageError(
-                    f"the command of '{name}' has targets of joints.", "Velocity or Reach of a driven body."
+                    f"the command of '{name}' has targets of joints.",
+                    "Velocity or Reach of a driven body.",
+                    todo="give Velocity or Reach for it.",
                 )
             velocity, omega = self._velocities(name, wanted, position, quat)
             drives[name] = Drive.from_velocities(self._times, position, quat, velocity[:, None], omega[:, None])
@@ -235,7 +248,9 @@ class ClosedLoop:
             wanted = given.get(chain.name, Targets({}))
             if not isinstance(wanted, Targets):
                 raise UsageError(
-                    f"the command of the jointed body '{chain.name}' is {wanted}.", "Targets of its joints."
+                    f"the command of the jointed body '{chain.name}' is {wanted}.",
+                    "Targets of its joints.",
+                    todo="give Targets, by joint or for all joints.",
                 )
             for name, value in wanted.values.items():
                 after[0, _joint_of(chain, name)] = _row(name, [value], 1)[0, 0]
@@ -295,7 +310,11 @@ def _joint_of(chain: Chain, name: str) -> int:
     known = [joint.name for joint in chain.moving if bool((joint.stiffness > 0).any())]
     if name not in known:
         near = did_you_mean(name, known)
-        raise UsageError(f"'{chain.name}' has no joint '{name}' with a servo.", ", ".join(known) + "." + near)
+        raise UsageError(
+            f"'{chain.name}' has no joint '{name}' with a servo.",
+            ", ".join(known) + "." + near,
+            todo="name a joint of this list; which have a servo is in the [[articulations]] of the model.",
+        )
     return chain.joint_names.index(name)
 
 
@@ -338,5 +357,9 @@ def _row(name: str, values: ArrayLike | Tensor, size: int) -> Tensor:
     """Return the values of a command as a row (1, size), float64 on the CPU."""
     row = torch.as_tensor(values, dtype=torch.float64, device="cpu").detach()
     if row.shape != (size,) or not bool(torch.isfinite(row).all()):
-        raise UsageError(f"the command of '{name}' has {row.tolist()}.", f"{size} finite numbers.")
+        raise UsageError(
+            f"the command of '{name}' has {row.tolist()}.",
+            f"{size} finite numbers.",
+            todo="give finite numbers, one for each joint.",
+        )
     return row[None]

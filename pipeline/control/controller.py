@@ -57,7 +57,7 @@ class Controller(PlanningController):
         model = model if isinstance(model, Model) else read_model(model)
         task = task if isinstance(task, ControlTask) else read_task(Path(task))
         if draws < 0:
-            raise UsageError(f"{draws} draws.", "0 or more.")
+            raise UsageError(f"{draws} draws.", "0 or more.", todo="give 0 for the mean parameters, or more.")
         self.task_world: TaskWorld = task_world(model, task)
         self.task = task
         where = str(resolve_device(device))

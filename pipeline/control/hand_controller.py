@@ -56,7 +56,7 @@ class HandController(PlanningController):
         model = model if isinstance(model, Model) else read_model(model)
         task = task if isinstance(task, HandTask) else read_hand_task(Path(task))
         if draws < 0:
-            raise UsageError(f"{draws} draws.", "0 or more.")
+            raise UsageError(f"{draws} draws.", "0 or more.", todo="give 0 for the mean parameters, or more.")
         self.hand: HandWorld = hand_world(model, task)
         self.task = task
         self.goal_wxyz = np.array(task.start.quat_wxyz)
@@ -97,7 +97,11 @@ class HandController(PlanningController):
         """
         goal = np.asarray(goal_wxyz, float)
         if goal.shape != (4,) or not np.isfinite(goal).all() or not np.linalg.norm(goal) > 1e-9:
-            raise UsageError(f"a goal of {np.asarray(goal_wxyz).tolist()}.", "w, x, y, z of an orientation.")
+            raise UsageError(
+                f"a goal of {np.asarray(goal_wxyz).tolist()}.",
+                "w, x, y, z of an orientation.",
+                todo="give four finite numbers that are not all 0.",
+            )
         self.goal_wxyz = goal / np.linalg.norm(goal)
 
     def _sent_since(self, state: ControlState) -> Targets | None:

@@ -145,7 +145,11 @@ class HandScenePlant:
             self._model = self._mujoco.MjModel.from_xml_path(str(path))
         except ValueError as error:
             found = f"{task.source}: [plant] scene: {path}: MuJoCo cannot read it: {error}."
-            raise InputDataError(found, "an MJCF file.") from error
+            raise InputDataError(
+                found,
+                "an MJCF file.",
+                todo="correct the file until `python -m mujoco.viewer` opens it, or name another.",
+            ) from error
         self._data = self._mujoco.MjData(self._model)
         self._body = self._object(task, str(path))
         self._places = [self._joint(name, str(path)) for name in hand.joints]
@@ -206,11 +210,19 @@ class HandScenePlant:
         known = [model.joint(number).name for number in range(model.njnt)]
         if name not in known:
             near = did_you_mean(name, known)
-            raise InputDataError(f"{path}: the scene has no joint '{name}'.", f"{', '.join(known)}.{near}")
+            raise InputDataError(
+                f"{path}: the scene has no joint '{name}'.",
+                f"{', '.join(known)}.{near}",
+                todo="correct the name in the task, or add the joint to the scene.",
+            )
         number = model.joint(name).id
         servos = [k for k in range(model.nu) if model.actuator_trntype[k] == 0 and model.actuator_trnid[k, 0] == number]
         if not servos:
-            raise InputDataError(f"{path}: joint '{name}' has no servo.", "a position actuator for every joint.")
+            raise InputDataError(
+                f"{path}: joint '{name}' has no servo.",
+                "a position actuator for every joint.",
+                todo="add <position joint=...> for it to the scene.",
+            )
         return int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number]), servos[0]
 
     def _change(self, plant: HandPlantSection) -> None:

@@ -181,7 +181,9 @@ def _hand(task: HandTask) -> Articulation:
         raise InputDataError(found, error.allowed, todo) from error
     if not hand.joints:
         raise InputDataError(
-            f"{task.source}: [robot] file: {hand.path} has no joint that moves.", "a hand with hinges or slides."
+            f"{task.source}: [robot] file: {hand.path} has no joint that moves.",
+            "a hand with hinges or slides.",
+            todo="name a file with joints that are not fixed.",
         )
     return hand
 

@@ -45,7 +45,11 @@ def replays_of(model: Path, run: Path) -> tuple[Model, dict[str, Replay]]:
             motions[f"seed {one.seed}"] = _plant(found, one)
             motions[f"seed {one.seed}, predicted {AHEAD_S:g} s before"] = _predicted(found, one)
     if not motions:
-        raise InputDataError(f"{run}: no run has a command.", "runs with commands.")
+        raise InputDataError(
+            f"{run}: no run has a command.",
+            "runs with commands.",
+            todo="run 'cgwm control' again until at least one plan is executed.",
+        )
     seen = found.world.body_names[found.object] in found.model.body_splats
     return visible_model(found) if seen else found.model, motions
 

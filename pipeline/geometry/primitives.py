@@ -56,7 +56,9 @@ def shape_mesh(shape: Shape, capture_root: Path) -> Mesh:
         faces[inwards] = faces[inwards][:, ::-1]
         return Mesh(shape.sphere.radius_m * directions, faces)
     if shape.box is None:
-        raise InputDataError("a shape without a surface of triangles.", "box, sphere, mesh.")
+        raise InputDataError(
+            "a shape without a surface of triangles.", "box, sphere, mesh.", todo="give the body one of these shapes."
+        )
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
     faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]

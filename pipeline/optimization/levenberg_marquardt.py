@@ -106,7 +106,10 @@ def minimise(
     report = None if on_iteration is None else lambda step, descent: on_iteration(step, float(descent.cost[0]))
     end = descend(problem, Point(values=shared[None], states=(states,)), policy, report)
     if not bool(end.history[0].isfinite()):
-        raise NotConvergedError("the model diverges already at the start of the fit (no finite residual).")
+        raise NotConvergedError(
+            "the model diverges already at the start of the fit (no finite residual).",
+            todo="check the units of the tracks and the shape of the bodies, or start from another model: --from.",
+        )
     return _solution(problem, end)
 
 

@@ -40,26 +40,37 @@ def require_chains(world: World) -> None:
         if body.motion == "link" and name not in owner:
             raise InputDataError(f"{world.called(f'body {name!r}')} is a link of no chain.", todo="add it to a chain.")
     if world.chains and world.contact.name != "closed_form":
-        raise UsageError("the published contact law does not know jointed bodies.", "the contact law closed_form.")
+        raise UsageError(
+            "the published contact law does not know jointed bodies.",
+            "the contact law closed_form.",
+            todo="fit with the contact law closed_form, which is the default.",
+        )
 
 
 def _require_tree(world: World, chain: Chain, bodies: Mapping[str, Body], owner: dict[str, str]) -> None:
     place = world.called(f"chain '{chain.name}'")
     if chain.base not in BASES:
-        raise InputDataError(f"{place}: its base is '{chain.base}'.", ", ".join(BASES) + ".")
+        raise InputDataError(f"{place}: its base is '{chain.base}'.", ", ".join(BASES) + ".", todo="correct base.")
     seen: list[str] = []
     for link, parent in zip(chain.links, ("", *(joint.parent for joint in chain.joints)), strict=True):
         if link not in bodies or bodies[link].motion != "link":
             links = [name for name, body in bodies.items() if body.motion == "link"]
             raise InputDataError(
-                f"{place}: '{link}' is not a body with motion \"link\" of this world.", ", ".join(links) + "."
+                f"{place}: '{link}' is not a body with motion \"link\" of this world.",
+                ", ".join(links) + ".",
+                todo='name one of these bodies, or add it with motion = "link".',
             )
         if link in owner:
-            raise InputDataError(f"{place}: '{link}' is carried by two joints: a loop.", "a tree of links.")
+            raise InputDataError(
+                f"{place}: '{link}' is carried by two joints: a loop.",
+                "a tree of links.",
+                todo="take one of the two joints out.",
+            )
         if parent and parent not in seen:
             raise InputDataError(
                 f"{place}: '{link}' hangs on '{parent}', which is not among the links before it.",
                 "a tree of links, parents before children.",
+                todo="list the joints from the root outwards.",
             )
         owner[link] = chain.name
         seen.append(link)
@@ -82,7 +93,9 @@ def require_touching(place: str, chain: Chain) -> None:
     known = chain.links
     for name in (*(name for pair in chain.touching for name in pair), *chain.within):
         if name not in known:
-            raise InputDataError(f"{place}: there is no link '{name}'.", ", ".join(known) + ".")
+            raise InputDataError(
+                f"{place}: there is no link '{name}'.", ", ".join(known) + ".", todo="name one of these links."
+            )
     for first, second in chain.touching:
         rows = [chain.above[known.index(name)] for name in (first, second)]
         if chain.base == "free" or any(map(all, zip(*rows, strict=True))) or not any(map(any, rows)):
@@ -90,6 +103,7 @@ def require_touching(place: str, chain: Chain) -> None:
                 f"{place}: '{first}' and '{second}' cannot touch each other: a joint or a free root moves both, or "
                 "none moves either.",
                 "links on different branches of a root that is not free.",
+                todo="take the pair out, or name links on different branches.",
             )
 
 
@@ -103,9 +117,14 @@ def _require_inertia(place: str, chain: Chain, bodies: Mapping[str, Body]) -> No
             raise InputDataError(
                 f"{place}: joint '{joint.name}' moves links without mass and has no inertia of its own.",
                 "a link with mass, or reflected inertia, damping or servo gain above 0.",
+                todo="give the link a mass, or the joint armature, damping or a servo.",
             )
     if chain.base == "free" and not heavy[chain.root]:
-        raise InputDataError(f"{place}: its free root '{chain.root}' has no mass.", "a mass above 0 kg.")
+        raise InputDataError(
+            f"{place}: its free root '{chain.root}' has no mass.",
+            "a mass above 0 kg.",
+            todo="give the body of the root a mass.",
+        )
 
 
 def on_joints(world: World, state: State) -> State:
@@ -220,7 +239,9 @@ def with_joints(
     known = [name for chain in world.chains for name in chain.joint_names]
     unknown = [name for given in (values, speeds or {}) for name in given if name not in known]
     if unknown:
-        raise UsageError(f"there is no moving joint '{unknown[0]}'.", ", ".join(known) + ".")
+        raise UsageError(
+            f"there is no moving joint '{unknown[0]}'.", ", ".join(known) + ".", todo="name one of these joints."
+        )
     for chain in world.chains:
         state = _posed(world, state, chain, values, speeds or {})
     return state

@@ -58,7 +58,9 @@ def require_physical(world: World) -> None:
     require_chains(world)
     if world.pair_laws and not isinstance(world.contact, ContactLaw):
         raise UsageError(
-            f"the contact law '{world.contact.name}' has no laws of pairs of materials.", "closed_form with them."
+            f"the contact law '{world.contact.name}' has no laws of pairs of materials.",
+            "closed_form with them.",
+            todo="take the pairs of materials out, or fit with closed_form.",
         )
     for pair, law in ((None, world.contact), *world.pair_laws.items()):
         _require_law(world, pair, law)

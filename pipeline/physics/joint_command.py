@@ -120,20 +120,30 @@ class JointCommand:
             raise InputDataError(
                 f"the command of the chain '{chain.name}' has {command.coefficients.shape[-2]} joints.",
                 f"{count}: {', '.join(chain.joint_names)}.",
+                todo="give a value for each of these joints, in this order.",
             )
         return JointCommand(*(x.to(like) for x in vars(command).values()))
 
 
 def _require(times_s: Tensor, values: Tensor, hold: str) -> None:
     if hold not in HOLDS:
-        raise UsageError(f"the command of the joints goes between knots as '{hold}'.", ", ".join(HOLDS) + ".")
+        raise UsageError(
+            f"the command of the joints goes between knots as '{hold}'.",
+            ", ".join(HOLDS) + ".",
+            todo="give one of these as hold.",
+        )
     if times_s.ndim != 2 or values.ndim != 3 or times_s.shape[1] != values.shape[1]:
         raise UsageError(
             f"the command of the joints has times {tuple(times_s.shape)} and values {tuple(values.shape)}.",
             "times (B, K) and values (B, K, joints).",
+            todo="give as many values as times.",
         )
     if not bool((times_s.detach().diff(dim=1) > 0).all()):
-        raise UsageError("the times of the joints' command do not increase.", "increasing times.")
+        raise UsageError(
+            "the times of the joints' command do not increase.",
+            "increasing times.",
+            todo="sort the knots by time, and leave out those that repeat.",
+        )
 
 
 def _pieces(times_s: Tensor, values: Tensor, hold: str) -> Tensor:

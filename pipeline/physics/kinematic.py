@@ -56,7 +56,11 @@ class Drive:
             )
         command = driven[body]
         if isinstance(command, JointCommand):
-            raise InputDataError(f"the driven body '{body}' has a command of joints.", "a track, or a Drive.")
+            raise InputDataError(
+                f"the driven body '{body}' has a command of joints.",
+                "a track, or a Drive.",
+                todo="give a track or a Drive; commands of joints belong to jointed bodies.",
+            )
         return command if isinstance(command, Drive) else Drive.of([command], like)
 
     @staticmethod

@@ -130,7 +130,11 @@ def shape_to_spheres(
     elif shape.box is not None:
         spheres = _box_spheres(np.array(shape.box.half_extents_m), max_spheres)
     else:
-        raise InputDataError("a shape without a kind.", "box, sphere, mesh, splats.")
+        raise InputDataError(
+            "a shape without a kind.",
+            "box, sphere, mesh, splats.",
+            todo="give the body one of these shapes in capture.toml.",
+        )
     return spheres.splats(radius_factor), spheres.distance_m
 
 

@@ -41,6 +41,7 @@ def link_spheres(articulation: Articulation, max_spheres: int) -> dict[str, Sphe
         raise InputDataError(
             f"{articulation.path}: {max_spheres} spheres for {len(solid)} links.",
             f"{LEAST_SPHERES * len(solid)} or more: {LEAST_SPHERES} a link.",
+            todo="allow more spheres: --set sg-gs.max_collision_spheres=N.",
         )
     meshes = {link.name: [mesh_of_part(part) for part in link.geometry] for link in solid}
     areas = {name: sum(_area(mesh) for mesh in parts) for name, parts in meshes.items()}

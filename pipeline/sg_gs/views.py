@@ -226,7 +226,9 @@ def _with_features_scaled(views: list[View]) -> list[View]:
     if len(set(widths.values())) > 1:
         name, other = sorted(widths, key=lambda name: widths[name])[:: len(widths) - 1][:2]
         raise InputDataError(
-            f"features/: {widths[name]} channels for {name}, {widths[other]} for {other}.", "the same number for all."
+            f"features/: {widths[name]} channels for {name}, {widths[other]} for {other}.",
+            "the same number for all.",
+            todo="compute the features again with one network for all images.",
         )
     low = torch.stack([value.amin((0, 1)) for value in maps.values()]).amin(0)
     high = torch.stack([value.amax((0, 1)) for value in maps.values()]).amax(0)

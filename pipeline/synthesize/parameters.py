@@ -334,7 +334,9 @@ def with_parameter(file: ModelFile, name: str, value: float) -> ModelFile:
     if not can_vary(file, name):
         legal = settable(file)
         raise InputDataError(
-            f"the model has no physical parameter '{name}'.", f"{', '.join(legal)}.{did_you_mean(name, legal)}"
+            f"the model has no physical parameter '{name}'.",
+            f"{', '.join(legal)}.{did_you_mean(name, legal)}",
+            todo="correct the name in the plan.",
         )
     if name == "ground_offset_m" and file.ground is not None:
         return file.model_copy(update={"ground": file.ground.model_copy(update={"offset_m": value})})

@@ -24,7 +24,11 @@ def validate_ladder(path: Path, check_model: Callable[[Path], ValidationReport])
     file = read_json(document, ImproveResult)
     outside = [name for name in (*file.models, file.page) if real_path(path / name).parent != real_path(path)]
     if outside:
-        raise InputDataError(f"{document}: '{outside[0]}' lies outside of the ladder.", "names in its directory.")
+        raise InputDataError(
+            f"{document}: '{outside[0]}' lies outside of the ladder.",
+            "names in its directory.",
+            todo="copy the whole directory that 'cgwm improve' wrote, or run it again.",
+        )
     faults = [] if (path / file.page).is_file() else [f"the page {file.page} is missing."]
     faults += [fault for name in file.models for fault in _model_faults(path / name, file, check_model)]
     faults += _step_faults(file)

@@ -44,7 +44,11 @@ def validate_run(path: Path) -> ValidationReport:
     names = [name for name in (file.recording, file.page, file.video) if name is not None]
     outside = [name for name in names if real_path(path / name).parent != real_path(path)]
     if outside:
-        raise InputDataError(f"{document}: '{outside[0]}' lies outside of the run.", "names in its directory.")
+        raise InputDataError(
+            f"{document}: '{outside[0]}' lies outside of the run.",
+            "names in its directory.",
+            todo="copy the whole directory that 'cgwm control' wrote, or run it again.",
+        )
     faults = [f"control.json names {name}, which is missing." for name in names if not (path / name).is_file()]
     if (path / file.recording).is_file():
         if sha256(path / file.recording) != file.recording_sha256:

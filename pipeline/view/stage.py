@@ -43,7 +43,11 @@ def open_view(thing: Path | str, host: str = "127.0.0.1", port: int = 8080) -> V
     if kind == "model":
         return _model(path, host, port)
     found = "no such directory" if not path.exists() else f"a {kind}" if kind else "neither a dataset nor a model"
-    raise InputDataError(f"{path}: {found}.", "a directory with dataset.json or model.json.")
+    raise InputDataError(
+        f"{path}: {found}.",
+        "a directory with dataset.json or model.json.",
+        todo="name a dataset of 'cgwm synthesize' or a model of 'cgwm fit'.",
+    )
 
 
 def open_replays(

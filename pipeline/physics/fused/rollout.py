@@ -97,7 +97,11 @@ def roll(
     values, tangents = _values_and_tangents(packed.table, packed.steps, packed.geometry, packed.surfaces, packed.drives)
     dual = any(tangent is not None for tangent in tangents)
     if dual and record_contacts:
-        raise UsageError("the fused kernel has no derivatives of the contact record.", "record_contacts=False.")
+        raise UsageError(
+            "the fused kernel has no derivatives of the contact record.",
+            "record_contacts=False.",
+            todo="leave record_contacts out where derivatives are wanted, or roll out on the CPU without the kernel.",
+        )
     batch, count, bodies = packed.table.shape[0], times_s.shape[-1], len(world.bodies)
     structure = packed.structure
     shape = (structure.contacts, batch, structure.single, dual, structure.paired)
@@ -143,7 +147,11 @@ def require_one_kind(*tensors: Tensor) -> None:
     kinds = {(tensor.dtype, tensor.device) for tensor in tensors}
     if len(kinds) > 1:
         found = ", ".join(sorted(f"{dtype} on {device}" for dtype, device in kinds))
-        raise UsageError(f"the world, the state, the times and the commands are of several kinds: {found}.", "one.")
+        raise UsageError(
+            f"the world, the state, the times and the commands are of several kinds: {found}.",
+            "one.",
+            todo="convert all to one type on one device: .to(world.gravity).",
+        )
 
 
 def read_frames(world: World, times_s: Tensor, packed: Packed, frames: Tensor, labels: Tensor | None) -> Rollout:
