@@ -107,6 +107,13 @@ class TrackNoiseThresholds:
     least_jitter: float = threshold(
         0.01, "frames", "scatter of stated times about a regular clock from which the two are compared", BY_ARGUMENT
     )
+    usual_jitter: float = threshold(
+        0.5,
+        "1",
+        "share of the likeliest errors of times that the median of short fast windows has to show: contacts and hands "
+        "smear the ends of flights along the motion, too",
+        "by argument; 10 of 44 real-like development captures with right times were said to have wrong ones without it",
+    )
     seen_jitter: float = threshold(
         0.5,
         "sigmas",

@@ -3,7 +3,8 @@
 A time that is wrong by e moves a body of velocity v by e v, and turns it by e w at an angular velocity w: the error
 lies along the motion and grows with the speed. With independent errors of times of standard deviation s beside those of
 the tracking, of standard deviation q along each axis, the covariance of a position is q^2 I + s^2 v v^T. Both are
-estimated from what cubics leave of short windows of flight, along the motion and across it, by maximum likelihood.
+estimated from what polynomials leave of short windows of flight, along the motion and across it, by maximum
+likelihood.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from .track_noise import MAD_TO_STD, polynomial_residuals
 Array = NDArray[np.float64]
 LIMITS = TRACK_THRESHOLDS.track_noise
 
-CUBIC_FRAMES, DEGREE = 9, 3
-"""Frames of a window of flight, and degree of the polynomial that follows it."""
+FRAMES, DEGREES = 9, (3, 5)
+"""Frames of a window of flight, and degree of the polynomial that follows a centroid, and a point that may turn about
+the centre of mass."""
 TRIED_S = np.concatenate(([0.0], np.geomspace(1e-6, 5e-3, 75)))
 """Standard deviations of errors of times [s] that are tried."""
 FACTORS = np.geomspace(0.4, 2.5, 45)
@@ -49,50 +51,62 @@ def time_errors(whole: Observations, flight: Sequence[Segment]) -> tuple[float, 
         The standard deviation, and that of the tracking beside it [m].
     """
     parts = [part for item in flight for part in _flight_residuals(whole, item)]
-    if sum(len(speed) for speed, _, _ in parts) < LIMITS.enough:
+    if FRAMES * sum(len(speed) for speed, _, _ in parts) < LIMITS.enough:
         return 0.0, 0.0
     speed, along, across = (np.concatenate(every) for every in zip(*parts, strict=True))
-    time_s, std_m, evidence = _likeliest(speed, along, across)
+    kept = 1 - (1 + DEGREES[int(bool(whole.has_orientation.any()))]) / FRAMES  # degrees of freedom of a frame
+    time_s, std_m, evidence = _likeliest(speed.ravel(), along.ravel(), across.ravel(), kept)
     seen = evidence > LIMITS.sure_both and time_s * float(np.median(speed)) > LIMITS.seen_jitter * std_m
-    return (time_s, std_m) if seen else (0.0, std_m)
+    return (time_s, std_m) if seen and _usual(speed, along, across) > LIMITS.usual_jitter * time_s else (0.0, std_m)
+
+
+def _usual(speed: Array, along: Array, across: Array) -> float:
+    """Return the standard deviation of errors of times [s] that the median of fast windows (W, n) shows.
+
+    The smeared edge of a contact, or the rest of a hand, lies along the motion, too, but in the windows at the ends of
+    flights alone.
+    """
+    square, more = (speed**2).mean(1), (along**2 - across**2).mean(1)
+    fast = square >= np.median(square)
+    return float(np.sqrt(max(np.median(more[fast] / np.maximum(square[fast], 1e-12)), 0.0)))
 
 
 def _flight_residuals(whole: Observations, item: Segment) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield speeds (n,) [m/s], residuals along the motion (n,) and across it (n, 2) [m] of windows of a flight."""
+    """Yield speeds [m/s], residuals along the motion and across it [m] of windows of a flight, each (W, n)."""
     for column in range(len(whole.free)):
         frames = torch.arange(item.first, item.last + 1)
         frames = frames[whole.seen[item.episode, frames, column] > 0]
-        number = len(frames) // CUBIC_FRAMES
+        number, degree = len(frames) // FRAMES, DEGREES[int(bool(whole.has_orientation[:, :, column].any()))]
         if not number or float(whole.measured_axes[item.episode, column].min()) == 0:
             continue
-        rows = frames[: number * CUBIC_FRAMES].reshape(number, CUBIC_FRAMES)
+        rows = frames[: number * FRAMES].reshape(number, FRAMES)
         t = whole.times_s[item.episode, rows].numpy().astype(np.float64)
         places = whole.position_m[item.episode, rows, column].numpy().astype(np.float64)
         t = t - t.mean(1, keepdims=True)
-        left = polynomial_residuals(t, places, DEGREE)
-        velocity = np.gradient(places - left / np.sqrt(CUBIC_FRAMES / (CUBIC_FRAMES - DEGREE - 1)), axis=1)
+        left = polynomial_residuals(t, places, degree)
+        velocity = np.gradient(places - left / np.sqrt(FRAMES / (FRAMES - degree - 1)), axis=1)
         velocity = velocity / np.gradient(t, axis=1)[..., None]
         speed = np.linalg.norm(velocity, axis=-1)
         forward = velocity / np.maximum(speed, 1e-12)[..., None]
         along = (left * forward).sum(-1)
         rest = left - along[..., None] * forward
-        yield speed.ravel(), along.ravel(), np.linalg.norm(rest, axis=-1).ravel() / np.sqrt(2)
+        yield speed, along, np.linalg.norm(rest, axis=-1) / np.sqrt(2)
 
 
-def _likeliest(speed: Array, along: Array, across: Array) -> tuple[float, float, float]:
+def _likeliest(speed: Array, along: Array, across: Array, kept: float) -> tuple[float, float, float]:
     """Return the likeliest standard deviations of times [s] and of the tracking [m], and the evidence for the former.
 
     Args:
         speed: Speeds (n,) [m/s].
         along: Residuals along the motion (n,) [m].
         across: Root of the mean square of the two across it (n,) [m].
+        kept: Degrees of freedom of a frame of a window.
 
     Returns:
         Both, and twice the gain of the log-likelihood by errors of times.
     """
     rough = max(MAD_TO_STD * float(np.median(np.abs(across))), 1e-9)
     good = across < FAR * rough
-    kept = (CUBIC_FRAMES - DEGREE - 1) / CUBIC_FRAMES  # degrees of freedom of a frame of a window
     for _ in range(2):
         tried = (rough * FACTORS)[:, None] ** 2, TRIED_S[None] ** 2
         loss = 2 * (good.sum() * np.log(tried[0]) + (across[good] ** 2).sum() / tried[0]) + 0 * tried[1]

@@ -221,7 +221,7 @@ TRACK_NUMERICS = {
         "correlated_noise.LARGEST_TURN",
         "correlated_noise.LEAST",
         "flight_noise.WINDOW",
-        "time_errors.CUBIC_FRAMES, DEGREE",
+        "time_errors.FRAMES, DEGREES",
         "flight_noise.DEGREE",
         "flight_noise.SLOW_DEGREE",
         "track_noise.WINDOW",
