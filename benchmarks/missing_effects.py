@@ -135,8 +135,8 @@ def _added(rows: Sequence[dict[str, Any]]) -> list[str]:
 
     right = [row for row in rows if "errors" in row and judge(row["truth"], row["answer"])["mark"] in RIGHT]
     lines = []
-    for key in ("open_loop_m", "state_fitted_m"):
-        pairs = [(row["errors"]["before"][key], row["errors"]["after"][key]) for row in right]
+    for key in ("open_loop_m", "flight_m", "state_fitted_m"):
+        pairs = [(row["errors"]["before"].get(key), row["errors"]["after"].get(key)) for row in right]
         ratios = [after / before for before, after in pairs if before and after]
         if ratios:
             low, middle, high = np.percentile(ratios, (25, 50, 75))
