@@ -387,7 +387,7 @@ def test_failures_are_in_numbers(broken: Path) -> None:
 
 def test_a_sample_looks_at_some(broken: Path) -> None:
     assert change(broken, shifted_pose, demo=0)
-    reports = [validate(broken, sample=1, seed=seed) for seed in range(6)]
+    reports = [validate(broken, sample=1, seed=seed) for seed in range(4)]
     assert {report.facts["rollouts"] for report in reports} == {1}
     found = [{failure.demo for failure in report.failures} for report in reports]
     assert {"demo_0"} in found and set() in found  # it depends on the seed which one is looked at
@@ -408,7 +408,7 @@ def test_a_sample_reads_the_hashes_of_its_shards_only(good: Path, tmp_path: Path
     data = bytearray(second.read_bytes())
     data[-1] ^= 1  # of equal size
     second.write_bytes(data)
-    looked_at = [bool(validate(tmp_path / "out", sample=1, seed=seed).faults) for seed in range(8)]
+    looked_at = [bool(validate(tmp_path / "out", sample=1, seed=seed).faults) for seed in range(4)]
     assert True in looked_at and False in looked_at
     assert validate(tmp_path / "out").faults
 
