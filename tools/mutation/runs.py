@@ -21,7 +21,7 @@ from changes import Mutant, applied, sample
 from line_map import PACKAGES, environment_of
 from spread import fork_pytest, kill_group, preload
 
-TEST_START_S, PATIENCE = 60.0, 8.0
+TEST_START_S, PATIENCE = 45.0, 4.0
 """A run may take so long [s], and so many times what its tests took when they were mapped."""
 
 MOST_TESTS = 400
