@@ -90,6 +90,20 @@ def test_imports_run_one_way() -> None:
     assert wrong == []
 
 
+ABOUT_INPUT = ("InputDataError", "UsageError", "DamagedShardError")
+
+
+def test_every_error_about_an_input_says_what_is_allowed_or_what_to_do_next() -> None:
+    bare = [
+        place(path, node.lineno)
+        for path in FILES
+        for node, name in calls(path)
+        if name in ABOUT_INPUT and len(node.args) + len(node.keywords) < 2
+        if not any(isinstance(argument, ast.Starred) for argument in node.args)
+    ]
+    assert bare == []
+
+
 def test_rooms_import_lower_floors_only() -> None:
     assert import_graph.upward(import_edges(), import_graph.modules()) == []
 

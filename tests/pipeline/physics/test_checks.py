@@ -1,6 +1,5 @@
 """Worlds, starts and rollouts that cannot be right are refused by name and number."""
 
-import ast
 import json
 import math
 import tempfile
@@ -82,8 +81,8 @@ def test_a_rollout_that_diverges_names_environment_step_and_start_and_leaves_no_
     world = world_of(ball_body(), ground=False)
     start = State(*(x.repeat(2, 1, 1) for x in vars(HIGH).values()))
     start.velocity_m_s[1] = 1e308
-    rollout = simulate(world, start, times(2.0, 1.0))
-    with pytest.raises(NotConvergedError, match=r"environment 1 diverged by step 1000") as caught:
+    rollout = simulate(world, start, times(0.2, 10.0))
+    with pytest.raises(NotConvergedError, match=r"environment 1 diverged by step 100") as caught:
         require_finite(rollout, world, start)
     told = json.loads(caught.value.found.split("Its start: ")[1].removesuffix("."))
     assert told["ball"]["velocity_m_s"] == [1e308] * 3 and told["ball"]["quat_wxyz"] == [1.0, 0.0, 0.0, 0.0]
@@ -118,29 +117,6 @@ def test_a_body_that_an_effect_makes_impossible_is_refused() -> None:
     world = replace(world_of(box_body()), effects=(ActiveEffect.of(Emptied(), {"m": 1.0}),))
     with pytest.raises(InputDataError, match=r"body 'box': mass is -0.6 kg"):
         simulate(world, HIGH, times(0.02))
-
-
-ROOT = Path(__file__).parents[3]
-
-
-def raised_with_what_was_found_alone() -> list[str]:
-    """Return the places where an error about an input is made without saying what is allowed or what to do next."""
-    bare = []
-    for folder in ("schemas", "datasets", "pipeline", "cgwm_cli"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ABOUT_INPUT:
-                    unpacked = any(isinstance(argument, ast.Starred) for argument in node.args)
-                    if len(node.args) + len(node.keywords) < 2 and not unpacked:
-                        bare.append(f"{path.relative_to(ROOT)}:{node.lineno}")
-    return bare
-
-
-ABOUT_INPUT = ("InputDataError", "UsageError", "DamagedShardError")
-
-
-def test_every_error_about_an_input_says_what_is_allowed_or_what_to_do_next() -> None:
-    assert raised_with_what_was_found_alone() == []
 
 
 def test_messages_about_a_world_name_the_file_of_its_model() -> None:
