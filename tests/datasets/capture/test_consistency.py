@@ -31,7 +31,7 @@ def cube(half_m: float = 0.05) -> Body:
 def flight(force: Force, place: list[float], speed: list[float], seconds: float = 1.0, **plane) -> tuple:
     """Return times and places of a point that `force(velocity, place)` accelerates [m/s2] and a plane reflects."""
     normal, gap, bounce = np.array(plane.get("normal", (0, 0, 1.0))), plane.get("gap", 0.03), plane.get("bounce", True)
-    position, velocity, places, steps = np.array(place), np.array(speed), [], 6
+    position, velocity, places, steps = np.array(place), np.array(speed), [], 3
     time_s = np.arange(0, seconds, 1 / 120)
     for _ in time_s:
         places.append(position)
