@@ -24,6 +24,7 @@ from typing import Any, NoReturn
 import pytest
 from _pytest.tmpdir import TempPathFactory
 
+_read, _write = os.read, os.write  # tests put others in their places
 NUMBER = struct.Struct("<I")
 """A place in the list of files; what fits into a pipe at once is read at once, so that each is read by one fork."""
 
@@ -38,7 +39,7 @@ class Fork:
 
     def messages(self) -> Iterator[list[Any]] | None:
         """Return what it has sent since; None when it has ended."""
-        data = os.read(self.source, 1 << 20)
+        data = _read(self.source, 1 << 20)
         if not data:
             return None
         *lines, self.rest = (self.rest + data).split(b"\n")
@@ -60,7 +61,7 @@ class Forks:
             return None  # pytest lists the tests, or says which files cannot be read
         files = [list(items) for _, items in groupby(session.items, lambda item: item.path)]
         queue, fill = os.pipe()
-        os.write(fill, b"".join(map(NUMBER.pack, range(len(files)))))
+        _write(fill, b"".join(map(NUMBER.pack, range(len(files)))))
         os.close(fill)
         factory: TempPathFactory = self.config._tmp_path_factory  # pyright: ignore[reportAttributeAccessIssue]
         base = factory.getbasetemp()
@@ -174,14 +175,14 @@ class Forks:
         self.config.pluginmanager.unregister(name="terminalreporter")
 
     def _next(self, files: list[list[pytest.Item]], queue: int) -> list[pytest.Item]:
-        data = os.read(queue, NUMBER.size)
+        data = _read(queue, NUMBER.size)
         return files[NUMBER.unpack(data)[0]] if data else []
 
     def _send(self, *message: object) -> None:
         if self.target is not None:
             data = json.dumps(message).encode() + b"\n"
             while data:
-                data = data[os.write(self.target, data) :]
+                data = data[_write(self.target, data) :]
 
     def pytest_runtest_logstart(self, nodeid: str, location: tuple[str, int | None, str]) -> None:
         self._send("start", nodeid, location)
