@@ -88,6 +88,19 @@ def test_the_standard_error_of_a_gain_is_that_of_a_sum_of_independent_episodes()
     assert HeldOutGain(gains, misfit).std_error == pytest.approx(math.sqrt(len(gains) * variance) / misfit)
 
 
+@pytest.mark.parametrize(
+    ("gains", "misfit", "matters"),
+    [
+        ([9.0, 10.0, 11.0, 10.0, 9.5], 100.0, True),
+        ([9.0, 10.0, 11.0, 10.0, 9.5], 1e6, False),  # all agree on next to nothing
+        ([90.0, -30.0, 2.0, -20.0, 8.0], 100.0, False),  # one episode alone
+        ([-9.0, -10.0, -11.0, -10.0, -9.5], 100.0, False),
+    ],
+)
+def test_a_gain_matters_where_episodes_agree_and_it_shows(gains: list[float], misfit: float, matters: bool) -> None:
+    assert HeldOutGain(np.array(gains), misfit).matters is matters
+
+
 def test_only_wanted_parameters_have_a_prior_in_windows_of_first_contacts() -> None:
     parameters = [
         Parameter(name=name, unit="1", bounds=(0.01, 10.0), logarithmic=True, reveals="", prior=(median, 0.5))
