@@ -57,7 +57,8 @@ class Forks:
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
         """Run the tests in forks, and report what they send."""
-        if session.config.option.collectonly or session.testsfailed:
+        option = session.config.option
+        if option.collectonly or (session.testsfailed and not option.continue_on_collection_errors):
             return None  # pytest lists the tests, or says which files cannot be read
         files = [list(items) for _, items in groupby(session.items, lambda item: item.path)]
         queue, fill = os.pipe()
