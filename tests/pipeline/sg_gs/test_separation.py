@@ -122,7 +122,8 @@ def test_a_body_is_found_beside_one_with_masks_whose_labels_stay(balls):
     capture, views, true = balls
     masked = [with_labels(view, np.where(true[view.name] == 1, 1, 0).astype(np.uint8), 2) for view in views]
     both = with_bodies(capture, Body(name="ball-0"), Body(name="ball-1"))
-    result = separate(both, masked, [], Ground(), None, CONFIG)
+    longer = CONFIG.model_copy(update={"iterations": 100})  # after 60 steps nothing is solid beside the first ball
+    result = separate(both, masked, [], Ground(), None, longer)
     assert result is not None
     assert list(result.record) == ["ball-1"]
     for before, after in zip(masked, result.train, strict=True):
