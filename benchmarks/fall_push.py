@@ -243,10 +243,8 @@ def drawn(names: dict[str, Sequence[str]], captures: int | None) -> list[tuple[s
     pairs = list(itertools.product(names["objects"], names["materials"]))
     if captures is not None:
         pairs = [pairs[k] for k in np.random.default_rng(0).permutation(len(pairs))]
-    able = {
-        engine: [pair for pair in pairs if refusal(engine, load_item(pair[0]).solid) is None]
-        for engine in names["engines"]
-    }
+    solids = {obj: load_item(obj).solid for obj in names["objects"]}  # once each: a scan takes seconds
+    able = {engine: [pair for pair in pairs if refusal(engine, solids[pair[0]]) is None] for engine in names["engines"]}
     cells = [
         (index, (task, pair[0], pair[1], engine))
         for engine in names["engines"]
