@@ -1,4 +1,4 @@
-"""The verb `cgwm mask`: masks of a body in photos."""
+"""The verb `cgwm mask`: masks of a body in photos or videos."""
 
 from __future__ import annotations
 
@@ -37,17 +37,32 @@ def mask(
         str | None,
         typer.Option("--body", metavar="NAME", help="The body of the capture.", show_default="the only one"),
     ] = None,
+    empty: Annotated[
+        str | None,
+        typer.Option("--empty", metavar="EPISODE",
+                     help="Mask the videos of a capture instead of its photos: each camera filmed the place without "
+                     "the body in this episode. DIR is usually CAPTURE/video_masks.", show_default=False),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:  # fmt: skip
-    """Write masks of a body in photos, as calibrate and fit read them: 0 behind the body, its label on it."""
+    """Write masks of a body in photos or videos, as calibrate and fit read them: 0 behind the body, its label on it."""
     from ..schemas import UsageError
+
+    if empty is not None:
+        if box is not None or photo is not None:
+            raise UsageError(
+                "--empty is about videos, --box and --photo about photos.", todo="mask photos and videos in two calls."
+            )
+        from ..pipeline.mask import mask_videos
+
+        return emit(mask_videos(source, out, empty, body, overwrite), str)
 
     if photo is not None and box is None:
         raise UsageError("--photo names the photo of a box, and there is no --box.", todo="give both or neither.")
     borders = None if box is None else _borders(box)
     from ..pipeline.mask import mask as work
 
-    emit(work(source, out, borders, photo, body, overwrite), str)
+    return emit(work(source, out, borders, photo, body, overwrite), str)
 
 
 def _borders(text: str) -> tuple[float, float, float, float]:

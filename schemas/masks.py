@@ -20,14 +20,15 @@ class MasksReport(FileModel):
     """`masks.json`."""
 
     format: Literal["cgwm-masks/1"] = "cgwm-masks/1"
-    method: Literal["plain", "turntable", "box"]
-    """What told the body from the rest: a background of one colour, surroundings that stand, or a box."""
+    method: Literal["plain", "turntable", "box", "empty"]
+    """What told the body from the rest: a background of one colour, surroundings that stand, a box, or a film of the
+    empty place."""
     body: str = ""
     """Name of the body; empty where the photos were not those of a capture with bodies."""
     label: int
     """Its label in the masks."""
     photos: dict[str, PhotoMask]
-    """By photo."""
+    """By photo, or by frame of a video: `<camera>/<episode>/<frame>.png`."""
     versions: dict[str, str] = {}
 
     @property
@@ -42,9 +43,10 @@ class MasksReport(FileModel):
             "plain": "what stands before a background of one colour",
             "turntable": "what turns before surroundings that stand",
             "box": "what is in the box, and looks alike in the other photos",
+            "empty": "what differs from the empty place",
         }[self.method]
         lines = [
             f"{len(self.photos)} masks of {self.body or 'the body'}, label {self.label}: {found}; it fills "
-            f"{100 * shares[0]:.1f} to {100 * shares[-1]:.1f} % of the photos"
+            f"{100 * shares[0]:.1f} to {100 * shares[-1]:.1f} % of the pictures"
         ]
         return "\n".join([*lines, *(f"look at {name}: {doubt}" for name, doubt in self.doubtful.items())])

@@ -82,7 +82,7 @@ def mask(
             _require_inside(given, reference, box)
         small = [_reduced(read_rgb(given.folder / name)) for name in progress(given.names, "photos", unit="photo")]
         method, masks = _masks(given, small, reference, box)
-        report = _report(given, method, masks)
+        report = masks_report(method, given.body, given.label, given.names, masks)
         for name, found in zip(given.names, masks, strict=True):
             width, height = image_size(given.folder / name)
             large = cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
@@ -111,6 +111,15 @@ def _photos(source: Path, body: str | None) -> _Photos:
             "a name for each photo: its mask is <name>.png.",
             "rename one of them.",
         )
+    return _Photos(folder, names, *body_of(source, bodies, body))
+
+
+def body_of(source: Path, bodies: Sequence[str], body: str | None) -> tuple[str, int]:
+    """Return the body that is masked, empty without any, and its label.
+
+    Raises:
+        UsageError: If there is no such body, or there are several and none is named.
+    """
     if body is not None and body not in bodies:
         listed = ", ".join(bodies) or "none: a folder of photos has no bodies"
         raise UsageError(f"--body {body}: no such body in {source}.", f"bodies: {listed}.", "name one of them.")
@@ -119,7 +128,7 @@ def _photos(source: Path, body: str | None) -> _Photos:
             f"{source} has {len(bodies)} bodies: {', '.join(bodies)}.", "one body in a run.", "--body NAME."
         )
     chosen = body or (bodies[0] if bodies else "")
-    return _Photos(folder, names, chosen, bodies.index(chosen) + 1 if chosen else 1)
+    return chosen, bodies.index(chosen) + 1 if chosen else 1
 
 
 def _reference(given: _Photos, photo: str | None) -> int:
@@ -171,23 +180,29 @@ def _masks(
     )
 
 
-def _report(given: _Photos, method: str, masks: Sequence[Mask]) -> MasksReport:
+def masks_report(method: str, body: str, label: int, names: Sequence[str], masks: Sequence[Mask]) -> MasksReport:
+    """Return the content of `masks.json`, given the names of the pictures and their masks.
+
+    Raises:
+        NotConvergedError: If the body is in fewer than half of them.
+    """
     photos = {
         name: PhotoMask(share=round(float(found.mean()), 5), doubt=doubt)
-        for name, found, doubt in zip(given.names, masks, doubts(masks), strict=True)
+        for name, found, doubt in zip(names, masks, doubts(masks), strict=True)
     }
     empty = sum(not found.any() for found in masks)
     if empty > (1 - _LEAST_FOUND) * len(masks):
         raise NotConvergedError(
-            f"The body was found in {len(masks) - empty} of {len(masks)} photos.",
+            f"The body was found in {len(masks) - empty} of {len(masks)} pictures.",
             f"at least {_LEAST_FOUND:.0%} of them.",
-            "give a --box that holds the whole body and little else, in a photo from the middle of the series.",
+            "give a --box that holds the whole body and little else, in a photo from the middle of the series, or film "
+            "the empty place without the body.",
         )
     return MasksReport.model_validate(
         {
             "method": method,
-            "body": given.body,
-            "label": given.label,
+            "body": body,
+            "label": label,
             "photos": photos,
             "versions": {"opencv": cv2.__version__},
         }

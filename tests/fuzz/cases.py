@@ -76,6 +76,7 @@ SETTINGS = {
         "synthesize.seed",
         "synthesize.shards",
         "synthesize.compression",
+        "synthesize.shadows",
         "synthesize.plan",
     ),
 }
@@ -91,7 +92,7 @@ OPTIONS = {
     "export": ("--split", "--cameras", "--every", "--task", "--rollout", "--mask", "--sh-degree", "--duration"),
     "import": ("--train", "--test", "--seed", "--only", "--columns", "--length-unit", "--time-unit", "--body"),
     "view": ("--port", "--host"),
-    "mask": ("--box", "--photo", "--body"),
+    "mask": ("--box", "--photo", "--body", "--empty"),
     "calibrate": ("--seed", "--target", "--intrinsics"),
 }  # fmt: skip
 

@@ -79,6 +79,13 @@ def _mask(folder: Path) -> Command:
     return Command(words=words, out=("out",), check=(["validate", str(folder / "out")],))
 
 
+def _mask_videos(folder: Path) -> Command:
+    test_mask.films(folder / "capture")
+    out = "capture/video_masks"
+    words = ["mask", str(folder / "capture"), "--empty", "empty", "--out", str(folder / out)]
+    return Command(words=words, out=(out,), check=(["validate", str(folder / out)],))
+
+
 def _target(folder: Path) -> Command:
     write_photos(folder / "board", 9)
     out = "board/intrinsics.json"
@@ -210,6 +217,7 @@ def _control(folder: Path) -> Command:
 # not `export --to rerun`: Rerun stamps what it writes with the time, so that no two runs give the same bytes
 CASES: dict[str, Callable[[Path], Command]] = {
     "mask": _mask,
+    "mask --empty": _mask_videos,
     "mask --overwrite": _replacing(_mask, "--box", "30,20,90,70"),
     "calibrate": _calibrate,
     "calibrate --overwrite": _replacing(_calibrate, "--seed", "5", "--set", "calibrate.max_features=600"),

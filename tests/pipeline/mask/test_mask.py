@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from cgwm.datasets.capture.images import read_label, write_image
-from cgwm.pipeline.mask import mask
+from cgwm.pipeline.mask import mask, mask_videos
 from cgwm.pipeline.mask.doubts import doubts
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import InputDataError, NotConvergedError, OutputExistsError, UsageError
@@ -100,11 +100,57 @@ def test_what_cannot_be_done_is_refused_and_leaves_nothing(tmp_path: Path) -> No
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["empty", "photos", "twice"]
 
 
+def films(capture: Path) -> list[np.ndarray]:
+    """Write a film of an empty place and one of a darker exposure, in which a disc and its shadow move; return it."""
+    rng, place = np.random.default_rng(0), texture(7, 60, 200)
+
+    def film(episode: str, pictures: list[np.ndarray]) -> None:
+        for number, picture in enumerate(pictures):
+            path = capture / "videos" / "left" / episode / f"{number:06d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_image(path, (picture + rng.normal(0, 2, picture.shape)).clip(0, 255).astype(np.uint8))
+
+    discs, pictures = [], []
+    for k in range(6):
+        disc, shade = (
+            cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), (30 + 12 * k + off, 40 + off), 15, 1, cv2.FILLED) > 0
+            for off in (0, 10)
+        )
+        shaded = np.where(shade[..., None], 0.7 * place, place)
+        pictures.append(0.9 * np.where(disc[..., None], np.array([200.0, 60.0, 20.0]), shaded))
+        discs.append(disc)
+    film("empty", [place] * 8)
+    film("000", pictures)
+    (capture / "capture.toml").write_text('format = "cgwm-capture/1"\n[[bodies]]\nname = "a"\n')
+    return discs
+
+
+def test_a_body_is_cut_out_of_videos_by_a_film_of_the_empty_place(tmp_path: Path) -> None:
+    """Also where the exposure of a film differs, and without the shadow that the body casts."""
+    discs = films(tmp_path / "capture")
+    out = tmp_path / "capture" / "video_masks"
+    report = mask_videos(tmp_path / "capture", out, "empty")
+    assert report.method == "empty" and report.body == "a" and not report.doubtful and len(report.photos) == 6
+    for number, disc in enumerate(discs):
+        found = read_label(out / "left" / "000" / f"{number:06d}.png") == 1
+        assert (found & disc).sum() / (found | disc).sum() > 0.9
+    assert validate(out).faults == () and validate(tmp_path / "capture").faults == ()
+    for empty, error, text in (
+        ("none", InputDataError, "no video of episode 'none'"),
+        ("000", NotConvergedError, "differs from the empty place|found in"),
+    ):
+        with pytest.raises(error, match=text):
+            mask_videos(tmp_path / "capture", out, empty, overwrite=True)
+    with pytest.raises(InputDataError, match="no capture"):
+        mask_videos(tmp_path / "capture" / "videos", tmp_path / "other", "empty")
+    assert read_label(out / "left" / "000" / "000000.png").any() and not (tmp_path / "other").exists()
+
+
 def test_a_body_that_is_lost_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     photos = folder(tmp_path / "photos", scene("what moves")[0])
     nothing = [np.zeros((HEIGHT, WIDTH), bool)] * 4 + [np.ones((HEIGHT, WIDTH), bool)] * 2
     monkeypatch.setattr("cgwm.pipeline.mask.stage.from_box", lambda *_: nothing)
-    with pytest.raises(NotConvergedError, match=r"found in 2 of 6 photos"):
+    with pytest.raises(NotConvergedError, match=r"found in 2 of 6 pictures"):
         mask(photos, tmp_path / "masks", BOX)
     assert not (tmp_path / "masks").exists()
 
