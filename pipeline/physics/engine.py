@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 CPU_CONTACTS, CPU_ROLLOUTS, GPU_ROLLOUTS = 32_000, (160, 2048), 8192
 """Batch sizes: possible contacts on the CPU, minimum and maximum rollouts on the CPU, rollouts on a GPU."""
-LEAST_SAVED, LEAST_SHARE = 2000, 0.1
+LEAST_SAVED, LEAST_SHARE = 6000, 0.1
 """Minimum number of frames that a further group saves, absolute and as a share of all: a rollout takes milliseconds to
-prepare, as long as a few thousand frames of the kernel."""
+prepare, as long as some thousand frames of the kernel and of their residuals."""
 _MOTION = ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s")
 
 
