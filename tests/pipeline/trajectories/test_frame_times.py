@@ -10,7 +10,8 @@ from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.trajectories.frame_times import with_regular_times
 from cgwm.pipeline.trajectories.innovations import WHITE, CorrelatedNoise, NoiseModel, body_innovations
-from cgwm.pipeline.trajectories.time_errors import without_time_errors
+from cgwm.pipeline.trajectories.segmentation import Segment, whole_episodes
+from cgwm.pipeline.trajectories.time_errors import time_errors, without_time_errors
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.diagnosis_data import world_with
 
@@ -101,6 +102,19 @@ def test_wrong_times_of_exposures_are_measured_and_said_and_part_of_the_noise() 
     assert float(rows.square().sum() / prepared.flight.dof.sum()) == pytest.approx(1.0, abs=0.15)
     plain = prepare(world, throws(6, regular), Noise(NOISE_M, 0.01))
     assert plain.time_error_s == 0.0
+
+
+@pytest.mark.parametrize("smeared", [True, False])
+def test_smeared_ends_of_flights_are_no_errors_of_times(smeared: bool) -> None:
+    world, rng = world_with("ball"), np.random.default_rng(11)
+    episodes = throws(8, regular if smeared else late)
+    if smeared:
+        for _, tracks in episodes:
+            path = tracks["ball"].position_m
+            path[-9:] += np.gradient(path[-9:], STEP_S, axis=0) * 4 * JITTER_S * rng.standard_normal((9, 1))
+    whole = whole_episodes(world, episodes)
+    flights = [Segment(k, 0, len(tracks["ball"].time_s) - 1) for k, (_, tracks) in enumerate(episodes)]
+    assert time_errors(whole, flights)[0] == (0.0 if smeared else pytest.approx(JITTER_S, rel=0.15))
 
 
 @pytest.mark.parametrize(
