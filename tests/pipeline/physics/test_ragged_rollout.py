@@ -21,7 +21,7 @@ def test_groups_are_few_and_save_frames() -> None:
 def test_the_motion_is_the_same_up_to_each_end_and_then_keeps_its_last_frame() -> None:
     world = world_of(ball_body(), step_s=0.01)
     state = State.joined(*(state_of(((0, 0, 1 + 0.1 * k), (1, 0, 0, 0), (k, 0, 0), (0, k, 1))) for k in range(3)))
-    lengths, repeats = [3, 9, 4], 500
+    lengths, repeats = [3, 9, 4], LEAST_SAVED // 10 + 1  # a second group saves ten frames a repeat
     times = (torch.arange(9, dtype=F64) / 100).repeat(3, 1)
     every, rolled = state.repeat(repeats), []
 
