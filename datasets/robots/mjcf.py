@@ -42,6 +42,7 @@ def read_mjcf(path: Path) -> Articulation:
             "a tree of independent joints.",
             "leave <equality> out.",
         )
+    _require_plain_joints(path, model)
     trees = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
     if len(trees) != 1:
         names = ", ".join(model.body(body).name for body in trees)
@@ -56,6 +57,33 @@ def read_mjcf(path: Path) -> Articulation:
     for body in range(1, model.nbody):
         _append(path, model, body, links, joints, ends)
     return Articulation.tree(path.stem, path, links, joints)
+
+
+def _require_plain_joints(path: Path, model: Any) -> None:
+    """Refuse springs, tendons that pull, and actuators of anything but joints, which chains do not have.
+
+    Raises:
+        InputDataError: With the first of them.
+    """
+    springs = np.flatnonzero(_sizes(model.jnt_stiffness))
+    losses = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_limited)
+    tendons = np.flatnonzero(sum(map(_sizes, losses)))
+    others = np.flatnonzero(model.actuator_trntype != 0)
+    for found in (
+        *(f"joint '{model.joint(k).name}' has a spring" for k in springs),
+        *(f"tendon '{model.tendon(k).name}' has a spring, damping, friction or limits" for k in tendons),
+        *(f"actuator '{model.actuator(k).name}' does not act on a joint" for k in others),
+    ):
+        raise InputDataError(
+            f"{path}: {found}.",
+            "joints with servos (<position joint=...>), damping, armature, frictionloss and limits.",
+            "leave it out, or give the joint a servo in its place.",
+        )
+
+
+def _sizes(numbers: Array) -> Array:
+    """Return the sum of the absolute numbers of each row, which may be a single one."""
+    return np.array([np.abs(row).sum() for row in numbers])
 
 
 def _append(

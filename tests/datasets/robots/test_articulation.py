@@ -140,6 +140,26 @@ def test_what_a_chain_cannot_be_is_refused(tmp_path: Path, old: str, new: str, m
         read_articulation(written(tmp_path, ARM.replace(old, new, 1)))
 
 
+@pytest.mark.parametrize(
+    ("joint", "more", "message"),
+    [
+        ('stiffness="0.1"', "", "joint 'z' has a spring"),
+        ("", '<tendon><fixed name="t" stiffness="3"><joint joint="z" coef="1"/></fixed></tendon>', "tendon 't' has a"),
+        (
+            "",
+            '<tendon><fixed name="t"><joint joint="z" coef="1"/></fixed></tendon>'
+            '<actuator><motor name="pull" tendon="t"/></actuator>',
+            "actuator 'pull' does not act on a joint",
+        ),
+    ],
+)
+def test_what_pulls_otherwise_than_a_servo_is_refused(tmp_path: Path, joint: str, more: str, message: str) -> None:
+    text = f"""<mujoco><worldbody><body><geom size="0.1"/><body><joint name="z" {joint}/><geom size="0.1"/></body>
+      </body></worldbody>{more}</mujoco>"""
+    with pytest.raises(InputDataError, match=re.escape(message)):
+        read_articulation(written(tmp_path, text, "arm.xml"))
+
+
 def test_servos_are_given_by_joint_name_and_need_limits(tmp_path: Path) -> None:
     found = read_articulation(written(tmp_path, ARM.replace('"revolute"', '"continuous"')))
     empty = {link.name: (np.zeros((0, 3)), np.zeros(0)) for link in found.links}
