@@ -195,9 +195,18 @@ class SegmentsThresholds:
     few_parameters: int = threshold(
         1,
         "parameters",
-        "an effect with more is not named: a friction map fits any law",
+        "`agreed_score` does not suffice for an effect with more: two numbers fit many laws",
         "report10: six tosses of the own engine's list without an effect of contact",
         "with two parameters 2 of 69 were named, both a friction by direction of a box",
+    )
+    first_score: float = threshold(
+        0.0,
+        "chi2",
+        "score of an effect in segments linearised without it, below which it is not named, and from which effects are "
+        "fitted",
+        "development, 55 captures: 2 of 27 without an effect and each large one that was named have it",
+        "the largest scores of fits without an effect (86 and 49) belong to effects with none",
+        (0, 27),
     )
     gain_t: float = threshold(
         1.0,
@@ -227,17 +236,27 @@ class SegmentsThresholds:
     )
     alone: tuple[tuple[str, float], ...] = threshold(
         (
-            ("torsional_friction", 15.0),
-            ("viscous_friction", 45.0),
+            ("torsional_friction", 30.0),
+            ("viscous_friction", 75.0),
             ("stribeck_friction", 60.0),
             ("adhesion", 80.0),
+            ("anisotropic_friction", 150.0),
         ),
         "chi2",
         "score of an effect that ranks first here, without slides, where no effect is named in flight and nothing is "
         "left there; an effect that is not listed is not named so",
-        "1.5 times the largest score of the same captures that passes all other thresholds: 10, 27, 37, 51",
+        "1.5 times the largest score of a false effect that passes all other thresholds, without fits (276 real-like "
+        "captures: 10, 27, 37, 51, 45) and with them (55 of development: none, 49, none, none, none); friction by "
+        "direction 2.5 times the largest of all false ones (60), as two numbers fit more laws",
         "the same captures: none named",
-        (0, 276),
+        (0, 303),
+    )
+    sure: float = threshold(
+        2.0,
+        "1",
+        "factor of this score from which `gain_t` suffices: the gain of one episode that is far above the others' "
+        "raises the scatter more than the mean",
+        BY_ARGUMENT,
     )
     unlike_laws: tuple[str, ...] = threshold(
         ("torsional_friction",),

@@ -55,6 +55,8 @@ class Evidence:
     """Whether it repeats beside the scatter between episodes; None where it was not refitted."""
     numbers: dict[str, tuple[float, float]] | None = None
     """Estimate and standard error by parameter; None where only the score test was made."""
+    first_score: float = math.inf
+    """Score in contact segments that were linearised without it, where it was judged at its fit."""
     score: float = -math.inf
     """Fall of the loss of a contact test less the penalty of BIC; minus infinity in flight."""
     share: float = 0.0

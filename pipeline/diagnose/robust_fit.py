@@ -78,14 +78,15 @@ def with_segment_parameters(linear: Linearization) -> Linearization:
     )
 
 
-def robust_fit(linear: Linearization, columns: Sequence[int]) -> RobustFit:
-    """Minimize the robust loss over chosen parameters, starting at zero; lower bounds at zero are kept.
+def robust_fit(linear: Linearization, columns: Sequence[int], start: Array | None = None) -> RobustFit:
+    """Minimize the robust loss over chosen parameters; lower bounds at zero are kept.
 
     Args:
         linear: The linearization.
         columns: Columns of the parameters, including the model's.
+        start: Values to start from, of all parameters (P,); zero by default.
     """
-    problem = _RobustProblem(linear, columns, np.ones((1, len(linear.chi2))))
+    problem = _RobustProblem(linear, columns, np.ones((1, len(linear.chi2))), start)
     end = _fitted(problem)
     left = problem.left(end.point.values)
     return RobustFit(
@@ -98,7 +99,9 @@ def robust_fit(linear: Linearization, columns: Sequence[int]) -> RobustFit:
     )
 
 
-def robust_repetition(linear: Linearization, base: Sequence[int], columns: Sequence[int], tried: int) -> Repetition:
+def robust_repetition(
+    linear: Linearization, base: Sequence[int], columns: Sequence[int], tried: int, start: Array | None = None
+) -> Repetition:
     """Return whether an effect repeats from episode to episode beyond what the fit with it leaves.
 
     Args:
@@ -106,34 +109,32 @@ def robust_repetition(linear: Linearization, base: Sequence[int], columns: Seque
         base: Columns of the model's parameters, the first ones, which are fitted jointly.
         columns: Columns of the effect's parameters.
         tried: Number of effects that were tried; the p-value is corrected for it.
+        start: Values to start from, of all parameters (P,); zero by default.
     """
-    fit = robust_fit(linear, [*base, *columns])
+    fit = robust_fit(linear, [*base, *columns], start)
     misfit = max(1.0, float(fit.weight @ fit.chi2) / float(fit.weight @ linear.dof))
     found = repetition(replace(linear, weight=fit.weight), columns, misfit)
     return replace(found, p_value=min(1.0, tried * found.p_value))
 
 
-def robust_gains(linear: Linearization, base: Sequence[int], columns: Sequence[int]) -> Array:
-    """Return the fall of each episode's robust loss with an effect's parameters estimated from the other episodes.
+def losses_by_others(linear: Linearization, columns: Sequence[int], start: Array | None = None) -> Array:
+    """Return each episode's robust loss with parameters estimated from the other episodes.
 
     Args:
         linear: The linearization.
-        base: Columns of the model's parameters, which are fitted jointly.
-        columns: Columns of the effect's parameters.
+        columns: Columns of the parameters, including the model's.
+        start: Values to start from, of all parameters (P,); zero by default.
     """
     own = (linear.episode == np.unique(linear.episode)[:, None]).astype(np.float64)
-    losses = []
-    for chosen in (list(base), [*base, *columns]):
-        problem = _RobustProblem(linear, chosen, 1 - own)
-        loss, _ = problem.losses(_fitted(problem).point.values)
-        losses.append((loss.numpy() * own).sum(1))
-    return losses[0] - losses[1]
+    problem = _RobustProblem(linear, columns, 1 - own, start)
+    loss, _ = problem.losses(_fitted(problem).point.values)
+    return (loss.numpy() * own).sum(1)
 
 
 def _fitted(problem: _RobustProblem) -> Descent:
-    """Return the descent of a problem from zero, by Gauss-Newton steps without damping."""
+    """Return the descent of a problem by Gauss-Newton steps without damping."""
     policy = Policy(iterations=ITERATIONS, damping=0.0, least_damping=0.0, shares=STEPS, attempts=1, absolute=FALL)
-    return descend(problem, Point(values=torch.zeros_like(problem.box.low)), policy)
+    return descend(problem, Point(values=problem.start), policy)
 
 
 class _RobustProblem(Problem):
@@ -143,9 +144,12 @@ class _RobustProblem(Problem):
         linear: The linearization.
         columns: Columns of the parameters.
         counts: Weight of each segment in each group, in addition to its robust weight, shape (G, B).
+        start: Values to start from, of all parameters of the linearization (P,); zero by default.
     """
 
-    def __init__(self, linear: Linearization, columns: Sequence[int], counts: Array) -> None:
+    def __init__(
+        self, linear: Linearization, columns: Sequence[int], counts: Array, start: Array | None = None
+    ) -> None:
         chosen = list(columns)
         places, _ = layout(linear, chosen)
         prior = 1 / widths(linear, chosen) ** 2
@@ -158,6 +162,10 @@ class _RobustProblem(Problem):
         self.score = torch.as_tensor(linear.score[:, chosen])
         self.excess = torch.as_tensor(linear.chi2 - linear.dof)
         self.owner = torch.arange(len(counts))
+        first = np.zeros(len(prior))
+        if start is not None:
+            first[places] = start[chosen]
+        self.start = torch.as_tensor(first).expand(len(counts), -1).clone()
         parts = (
             torch.as_tensor(one).expand(len(counts), -1) for one in (low, np.full_like(low, np.inf), 0 * prior, prior)
         )

@@ -67,6 +67,7 @@ def refit(
     parameters: Sequence[Parameter],
     start: Tensor | None = None,
     iterations: int = ITERATIONS,
+    free: Sequence[str] = (),
 ) -> Refit:
     """Fit parameters and states, starting close to the solution.
 
@@ -76,10 +77,11 @@ def refit(
         parameters: What is fitted in addition to the states; priors are centred on the world's values.
         start: Values to start from (P,), in fitted coordinates; None for the world's values.
         iterations: Maximum number of steps.
+        free: Names of parameters without a prior.
     """
     centre = base_values(world, parameters)
     values = centre if start is None else start
-    prior = torch.tensor([1 / p.prior[1] ** 2 for p in parameters]).to(centre)
+    prior = torch.tensor([0.0 if p.name in free else 1 / p.prior[1] ** 2 for p in parameters]).to(centre)
     bounds = torch.tensor([p.limits for p in parameters]).reshape(-1, 2).to(centre)
     problem = _JointProblem([part.in_world(world) for part in parts], parameters, bounds, centre, prior)
     policy = Policy(

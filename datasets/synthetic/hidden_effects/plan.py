@@ -24,6 +24,7 @@ Stage = Literal[
     "report8",
     "report9",
     "report10",
+    "report11",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on the first stage alone. Results on a report stage were known when `diagnose` was changed
@@ -40,9 +41,10 @@ afterwards, so that each of these changes has to be judged on a later stage:
   became alternatives in captures without flight (2026-11-23);
 - `report8`: a value beyond the plausible size of its parameter counted against an effect, and segments of contact
   alone needed a larger score (2026-11-26);
-- `report9`: segments of contact named again what slides rank first, and some effects alone (2026-11-27).
+- `report9`: segments of contact named again what slides rank first, and some effects alone (2026-11-27);
+- `report10`: segments of contact were linearised at the fits of effects (2026-11-27).
 
-The present version is judged on `report10`."""
+The present version is judged on `report11`."""
 Noise = Literal["spread", "study"]
 
 UNKNOWN = tuple(name for name, entry in EFFECTS.items() if entry.acts == "unknown")

@@ -159,7 +159,7 @@ def selected(test: ContactTest, evidence: Sequence[Evidence], data: ContactData)
 
 def fitted_evidence(
     candidate: Candidate,
-    variant: Variant,
+    constants: dict[str, float],
     gain: float,
     values: Array,
     covariance: Array,
@@ -171,7 +171,7 @@ def fitted_evidence(
 
     Args:
         candidate: The candidate.
-        variant: The candidate at its constants.
+        constants: Its constants.
         gain: Fall of the loss by the candidate.
         values: Its fitted parameters (k,).
         covariance: Their covariance (k, k).
@@ -194,7 +194,7 @@ def fitted_evidence(
     names = [p.name for p in candidate.effect.parameters]
     return Evidence(
         candidate=candidate,
-        constants=variant.constants,
+        constants=constants,
         test=test,
         p_value=min(1.0, tail * tries),
         numbers={name: (float(v), float(s)) for name, v, s in zip(names, values, deviations, strict=False)},

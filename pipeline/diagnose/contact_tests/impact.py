@@ -141,7 +141,7 @@ class _Fits:
             freedom = max(float(self.degrees.sum()) - number, 1.0)
             one = fitted_evidence(
                 self.candidates[variant.place],
-                variant,
+                variant.constants,
                 gain=fall,
                 values=fit.values[-number:],
                 covariance=np.linalg.inv(fit.information)[-number:, -number:] * self.spread[part],

@@ -7,6 +7,10 @@ without effects, and restitution by speed never. Where slides rank the same effe
 other data, and a small score confirms it. A torque about the normal is no error of such a law, which has none at a
 point. Every segment has its own deviations of the contact parameters, segments that no candidate explains are
 downweighted, and the effect has to improve held-out episodes and to exceed its scatter between episodes.
+
+The segments are linearised without candidates first. Where one that can be named has a positive score there, it and its
+rivals are fitted, and each is judged where it fits (`candidate_fit`), in states that all fits share: a large effect is
+far from linear, and a state found without it hides it.
 """
 
 from __future__ import annotations
@@ -22,16 +26,21 @@ from numpy.typing import NDArray
 from ...physics.effects.effect import ActiveEffect
 from ...physics.world import World
 from ...segments.candidates import Candidate, Variant, base_parameters, base_values
-from ...segments.linearization import linearize
+from ...segments.linearization import Linearization, linearize
 from ...segments.segment_fit import refit
+from ...segments.segment_states import fit_states
 from ...segments.segments import Segments
+from ..candidate_fit import CandidateFit, candidate_fits
 from ..effect_selection import repeats
 from ..evidence import Evidence
-from ..robust_fit import RobustFit, robust_fit, robust_gains, robust_repetition, with_segment_parameters
+from ..robust_fit import RobustFit, losses_by_others, robust_fit, robust_repetition, with_segment_parameters
 from ..thresholds import THRESHOLDS, SegmentsThresholds
-from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of, variant_of
+from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
 
 Array = NDArray[np.float64]
+
+MOST_FITTED = 2
+"""Maximum number of parameters of an effect that is fitted; a friction map has nine."""
 
 
 @dataclass(frozen=True)
@@ -56,26 +65,21 @@ class SegmentsTest(ContactTest):
         variants = [v for v in data.variants(candidates, ("contact", "flight")) if _acts_near_ground(v)]
         if data.segments is None or not variants:
             return []
-        linear = linearize(data.segments, data.world, variants, data.prepared.groups, robust=True)
-        linear = with_segment_parameters(linear)
-        base = list(range(linear.base))
-        without, tries = robust_fit(linear, base), tries_of(variants)
-        penalty = math.log(max(linear.dof.sum(), 2.0))
-        found = []
-        for variant in variants:
-            fit = robust_fit(linear, [*base, *linear.columns(variant.parameters)])
-            candidate = candidates[variant.place]
-            found.append(_judged(candidate, variant, fit, without, penalty, tries[variant.place]))
-        results, shown, effects = [], _first_of_slides(data), len(tries)
-        for one in ranked(found):
-            columns = linear.columns(variant_of(one, variants, candidates).parameters)
-            gains = robust_gains(linear, base, columns)
-            score = one.score if one.test.admissible else -math.inf
-            # what slides rank first is the only hypothesis; without them the best of all effects is looked at
-            tried = 1 if shown is not None and shown.name == one.name else effects
-            repeated = robust_repetition(linear, base, columns, tried) if score > 0 else None
-            results.append(replace(one, gains=tuple(gains.tolist()), score=score, repetition=repeated))
-        return ranked(results)
+        first = _ranked(_linear_tests(data, data.segments, candidates, variants), data)
+        if not any(self._is_likely(one) for one in first):
+            return first
+        fitted = [one for one in first if _can_be_fitted(one)]
+        none, fits = candidate_fits(data.segments, data.world, fitted, data.prepared.groups)
+        tests = _linear_tests(data, none.segments.in_world(data.world), candidates, variants)
+        tries = {candidates[place].effect.name: count for place, count in tries_of(variants).items()}
+        at_fits = [tests[0].beside(one, fits[one.name], tries[one.name]) for one in fitted]
+        scores = {one.name: one.score for one in first}
+        return [replace(one, first_score=scores[one.name]) for one in _ranked([*tests, *at_fits], data)]
+
+    def _is_likely(self, one: Evidence) -> bool:
+        """Return whether a nameable effect of one parameter has a score where it is absent; then effects are fitted."""
+        single = len(one.candidate.effect.parameters) <= self.limits.few_parameters
+        return single and one.name in dict(self.limits.alone) and one.score > self.limits.first_score
 
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
         """Return the lead in score over effects that improve held-out episodes."""
@@ -84,11 +88,10 @@ class SegmentsTest(ContactTest):
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bars of an effect: where slides show it, too, and where segments alone do."""
         best, shown, slides = equals[0], _first_of_slides(data), THRESHOLDS.sliding
-        if len(best.candidate.effect.parameters) > self.limits.few_parameters or not repeats(best, 1):
-            return ()
-        if best.falls_at_rest:
+        if best.falls_at_rest or not repeats(best, 1) or best.first_score <= self.limits.first_score:
             return ()
         found, hidden = [], best.name in (*slides.in_impacts_alone, *slides.as_friction)
+        hidden = hidden or len(best.candidate.effect.parameters) > self.limits.few_parameters
         if shown is not None and shown.name == best.name and shown.score > self.limits.shown_score and not hidden:
             found.append(Bar(score=self.limits.agreed_score, gain_t=self.limits.gain_t))
         alone = dict(self.limits.alone).get(best.name)
@@ -96,6 +99,7 @@ class SegmentsTest(ContactTest):
         clear = data.explained and not data.flown
         if alone is not None and (clear or best.name in self.limits.unlike_laws):
             found.append(Bar(score=alone, gain_t=self.limits.alone_t))
+            found.append(Bar(score=self.limits.sure * alone, gain_t=self.limits.gain_t))
         return tuple(found)
 
     def added(self, data: ContactData, best: Evidence) -> tuple[World, Evidence] | None:
@@ -113,20 +117,99 @@ def _first_of_slides(data: ContactData) -> Evidence | None:
     return next((one for one in data.earlier.get("sliding", ()) if one.test.admissible), None)
 
 
+def _can_be_fitted(one: Evidence) -> bool:
+    """Return whether a candidate is fitted: one of contact whose number of parameters a few sizes cover."""
+    effect = one.candidate.effect
+    return effect.phase == "contact" and len(effect.parameters) <= MOST_FITTED
+
+
 def _acts_near_ground(variant: Variant) -> bool:
     """Return whether an effect acts in contact, or in flight by the distance from the ground."""
     effect = variant.active.effect
     return effect.phase == "contact" or "ground" in effect.needs
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Test:
+    """A candidate in linearised segments."""
+
+    evidence: Evidence
+    """Its evidence, without gains of held-out episodes."""
+    linear: Linearization
+    """The segments, linearised where the candidate is absent or at its fit."""
+    columns: list[int]
+    """Columns of the candidate's parameters."""
+    start: Array
+    """Parameters (P) that fits start from."""
+    without: RobustFit
+    """Fit without any candidate."""
+    lost: Array
+    """Loss of each held-out episode without any."""
+
+    def beside(self, one: Evidence, fit: CandidateFit, tries: int) -> _Test:
+        """Return the test of another candidate in segments linearised at its fit, against the same fit without any."""
+        at = robust_fit(fit.linear, fit.every, fit.start)
+        evidence = _judged(one.candidate, one.constants, at, self.without, _penalty(fit.linear), tries)
+        return replace(self, evidence=evidence, linear=fit.linear, columns=list(fit.columns), start=fit.start)
+
+    def told(self, tried: int) -> Evidence:
+        """Return the evidence with the gains of held-out episodes, and the repetition where its score is positive.
+
+        Args:
+            tried: Number of effects among which it was looked for.
+        """
+        base = list(range(self.linear.base))
+        gains = self.lost - losses_by_others(self.linear, [*base, *self.columns], self.start)
+        score = self.evidence.score if self.evidence.test.admissible else -math.inf
+        repeated = robust_repetition(self.linear, base, self.columns, tried, self.start) if score > 0 else None
+        return replace(self.evidence, gains=tuple(gains.tolist()), score=score, repetition=repeated)
+
+
+def _linear_tests(
+    data: ContactData, segments: Segments, candidates: Sequence[Candidate], variants: Sequence[Variant]
+) -> list[_Test]:
+    """Return the tests of all variants in segments linearised without any of them."""
+    linear = with_segment_parameters(linearize(segments, data.world, variants, data.prepared.groups, robust=True))
+    base = list(range(linear.base))
+    without, lost, tries = robust_fit(linear, base), losses_by_others(linear, base), tries_of(variants)
+    penalty, tests = _penalty(linear), []
+    for variant in variants:
+        columns = linear.columns(variant.parameters)
+        fit = robust_fit(linear, [*base, *columns])
+        one = _judged(candidates[variant.place], variant.constants, fit, without, penalty, tries[variant.place])
+        start = np.zeros(len(linear.parameters))
+        tests.append(_Test(evidence=one, linear=linear, columns=columns, start=start, without=without, lost=lost))
+    return tests
+
+
+def _ranked(tests: Sequence[_Test], data: ContactData) -> list[Evidence]:
+    """Return each candidate once, by its best test, with gains of held-out episodes, the best first."""
+    own = {id(one.evidence): one for one in tests}
+    best = ranked(one.evidence for one in tests)
+    shown = _first_of_slides(data)
+    # what slides rank first is the only hypothesis; without them the best of all effects is looked at
+    tried = [1 if shown is not None and shown.name == one.name else len(best) for one in best]
+    return ranked(own[id(one)].told(count) for one, count in zip(best, tried, strict=True))
+
+
+def _penalty(linear: Linearization) -> float:
+    """Return the penalty of BIC for each parameter."""
+    return math.log(max(linear.dof.sum(), 2.0))
+
+
 def _judged(
-    candidate: Candidate, variant: Variant, fit: RobustFit, without: RobustFit, penalty: float, tries: int
+    candidate: Candidate,
+    constants: dict[str, float],
+    fit: RobustFit,
+    without: RobustFit,
+    penalty: float,
+    tries: int,
 ) -> Evidence:
     """Return the evidence of a fit; its p-value treats the robust loss as twice a negative log-likelihood."""
     count = len(without.value)
     one = fitted_evidence(
         candidate,
-        variant,
+        constants,
         gain=without.cost - fit.cost,
         values=fit.value[count:],
         covariance=np.linalg.inv(fit.information)[count:, count:].astype(np.float64),
@@ -153,7 +236,8 @@ def _refitted(world: World, contact: Segments, evidence: Evidence) -> tuple[Worl
             f"{effect.name}."
         ):  # from the estimate of the score test: the cost is too rough near neutral
             start[k] = min(max(known[p.name.partition(".")[2]], p.bounds[0]), p.bounds[1])
-    found = refit([contact], added, parameters, start)
     own = [p for p in parameters if p.name.startswith(f"{effect.name}.")]
+    at = fit_states(contact.in_world(added), parameters, start)
+    found = refit([at], added, parameters, start, free=[p.name for p in own])
     estimates = {p.name.partition(".")[2]: found.number(p.name) for p in own}
     return found.world, estimates

@@ -276,7 +276,7 @@ def _judged(
         covariance = torch.linalg.pinv(fit.information[0], hermitian=True)[-number:, -number:].numpy() * spread
         one = fitted_evidence(
             candidates[variant.place],
-            variant,
+            variant.constants,
             gain=max(0.0, (base - fit.cost) / spread),
             values=fit.values[0, -number:].numpy().astype(np.float64),
             covariance=covariance,

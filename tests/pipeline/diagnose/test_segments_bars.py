@@ -28,7 +28,7 @@ def bars(one: Evidence, sliding: tuple[str, ...] = (), flown: bool = False, expl
 IMITATED = ["velocity_restitution", "ground_magnet", "rolling_resistance", "friction_patch"]
 
 
-@pytest.mark.parametrize("name", [*IMITATED, "anisotropic_friction"])
+@pytest.mark.parametrize("name", IMITATED)
 def test_segments_alone_do_not_name_what_laws_of_contact_imitate(name: str) -> None:
     assert bars(evidence(name, 1e6)) == []
     assert bars(evidence(name, 1e6), sliding=("stribeck_friction", name)) == []
@@ -37,13 +37,19 @@ def test_segments_alone_do_not_name_what_laws_of_contact_imitate(name: str) -> N
 @pytest.mark.parametrize("name", ["viscous_friction", "stribeck_friction"])
 def test_an_effect_that_ranks_first_among_slides_needs_less(name: str) -> None:
     alone = dict(LIMITS.alone)[name]
-    assert bars(evidence(name)) == [alone]
-    assert bars(evidence(name), sliding=(name,)) == [LIMITS.agreed_score, alone]
+    assert bars(evidence(name)) == [alone, LIMITS.sure * alone]
+    assert bars(evidence(name), sliding=(name,)) == [LIMITS.agreed_score, alone, LIMITS.sure * alone]
     assert LIMITS.agreed_score < alone
     # two numbers and nine fit laws that they are not; slides cannot show a restitution, and follow a pull by friction
-    for other in ("anisotropic_friction", "friction_patch", "velocity_restitution", "ground_magnet"):
+    for other in ("friction_patch", "velocity_restitution", "ground_magnet"):
         assert bars(evidence(other), sliding=() if other == "ground_magnet" else (other,)) == []
-    assert bars(evidence("adhesion"), sliding=("adhesion",)) == bars(evidence("adhesion")) != []
+    for other in ("adhesion", "anisotropic_friction"):
+        assert bars(evidence(other), sliding=(other,)) == bars(evidence(other)) != []
+
+
+def test_a_fit_names_no_effect_without_a_score_where_it_is_absent() -> None:
+    assert bars(replace(evidence("stribeck_friction"), first_score=0.1)) != []
+    assert bars(replace(evidence("stribeck_friction"), first_score=-0.1)) == []
 
 
 def test_dry_friction_at_rest_is_not_below_that_of_sliding() -> None:
@@ -55,7 +61,7 @@ def test_dry_friction_at_rest_is_not_below_that_of_sliding() -> None:
 
 def test_a_torque_about_the_normal_needs_no_slides_and_no_clear_flight() -> None:
     """No law of contact has one at a point, whatever its restitution and friction are."""
-    alone = [dict(LIMITS.alone)["torsional_friction"]]
+    alone = [factor * dict(LIMITS.alone)["torsional_friction"] for factor in (1.0, LIMITS.sure)]
     assert bars(evidence("torsional_friction"), flown=True, explained=False) == alone
     assert bars(evidence("viscous_friction"), flown=True) == bars(evidence("viscous_friction"), explained=False) == []
     assert bars(replace(evidence("torsional_friction"), repetition=Repetition(3.0, 0.2, 0.3))) == []

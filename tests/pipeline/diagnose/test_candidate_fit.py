@@ -1,0 +1,84 @@
+"""Contact segments at the fit of a candidate: the same quadratic from another origin, sizes that one step misses."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from cgwm.pipeline.diagnose.candidate_fit import measured_from
+from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData
+from cgwm.pipeline.diagnose.contact_tests.segments import SegmentsTest
+from cgwm.pipeline.diagnose.flight_equals import fitted_contact
+from cgwm.pipeline.diagnose.robust_fit import robust_fit
+from cgwm.pipeline.physics.effects import load_effect
+from cgwm.pipeline.physics.parameters import Parameter
+from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.linearization import Linearization
+from cgwm.pipeline.segments.prepare import prepare
+from helpers.diagnosis_data import tosses, world_with
+
+
+def quadratics(rows: Any, seen: Any) -> Linearization:
+    """Segments with residuals `seen` and slopes `rows`; the second parameter is one of a candidate."""
+    count = len(rows)
+    parameters = tuple(
+        Parameter(name=n, unit="1", prior=(0.0, 1e6), bounds=(-9.0, 9.0), logarithmic=False, reveals="") for n in "fe"
+    )
+    return Linearization(
+        parameters=parameters,
+        base=1,
+        information=np.einsum("bti,btj->bij", rows, rows),
+        score=np.einsum("bti,bt->bi", rows, seen),
+        weight=np.ones(count),
+        episode=np.arange(count),
+        group=np.zeros(count, np.int64),
+        prior=np.zeros(2),
+        chi2=(seen**2).sum(1),
+        dof=np.full(count, 20.0),
+    )
+
+
+def test_a_linearization_at_a_fit_is_that_of_the_same_rows_at_the_origin() -> None:
+    rng = np.random.default_rng(0)
+    rows, seen, offset = rng.standard_normal((12, 20, 2)), rng.standard_normal((12, 20)), np.array([0.3, -2.0])
+    at_fit = quadratics(rows, seen - rows @ offset)  # the residuals there, of rows that are linear
+    moved, direct = measured_from(at_fit, offset), quadratics(rows, seen)
+    np.testing.assert_allclose(moved.score, direct.score, atol=1e-9)
+    np.testing.assert_allclose(moved.chi2, direct.chi2, atol=1e-9)
+
+
+def test_a_robust_fit_from_the_fitted_values_keeps_the_segments_that_only_the_effect_explains() -> None:
+    """Without the effect, which half of the segments show, these lose their weight; the fit begins where they fit."""
+    rng = np.random.default_rng(1)
+    rows = rng.standard_normal((12, 20, 2)) * np.repeat([[1.0, 0.0], [1.0, 1.0]], 6, 0)[:, None]
+    linear = quadratics(rows, rows @ [0.0, 60.0] + rng.standard_normal((12, 20)))
+    alone = robust_fit(linear, [0])
+    found = robust_fit(linear, [0, 1], np.array([0.0, 60.0]))
+    assert found.value[1] == pytest.approx(60.0, abs=0.3)
+    assert found.cost < alone.cost
+    np.testing.assert_allclose(found.weight[6:], 1.0, atol=0.3)
+    assert alone.weight[6:].max() < 0.01
+
+
+@pytest.mark.evidence
+def test_a_friction_that_stops_the_spin_at_once_is_found_at_its_size() -> None:
+    """15 mm stop the spin of a box in a frame or two: one step from zero finds a fraction of it."""
+    truth, world = world_with("cube", {"torsional_friction": {"c_t": 0.015}}), world_with("cube")
+    prepared = prepare(world, tosses(truth, 3, count=5, duration_s=0.7))
+    fitted = fitted_contact(prepared, world)
+    assert fitted is not None
+    data = ContactData(prepared=prepared, world=fitted[0].world, segments=fitted[1], sliding=None)
+    names = ("torsional_friction", "viscous_friction", "stribeck_friction")
+    library = [Candidate(name, load_effect(name)) for name in names]
+    found = SegmentsTest().evidence(data, library)
+    assert found[0].name == "torsional_friction"
+    assert found[0].test.estimate[0] > 0.006
+    alone = SegmentsTest()
+    linear = next(one for one in _without_fits(alone, data, library) if one.name == "torsional_friction")
+    assert found[0].score > linear.score + 50
+    assert linear.test.estimate[0] < 0.5 * found[0].test.estimate[0]
+
+
+def _without_fits(test: SegmentsTest, data: ContactData, library: list[Candidate]) -> Any:
+    limits: Any = SimpleNamespace(alone=())
+    return SegmentsTest(limits=limits).evidence(data, library)
