@@ -64,6 +64,23 @@ def scene_of(repository: Path, folder: Path, name: str) -> Path:
     return scene
 
 
+def resized(scene: Path, factor: float) -> Path:
+    """Write a scene whose object has another size and the same mass beside a scene, and return it."""
+    if factor == 1.0:
+        return scene
+
+    def times(found: re.Match[str]) -> str:
+        return found[1] + " ".join(str(factor * float(number)) for number in found[2].split()) + found[3]
+
+    text = scene.read_text(encoding="utf-8")
+    text = re.sub(r'(<mesh name="object" (?![^>]*scale)[^>]*?)(/>)', r'\1 scale="1 1 1"\2', text)
+    text = re.sub(r'(<mesh name="object" [^>]*scale=")([^"]*)(")', times, text)
+    text = re.sub(r'(<geom name="obj" type="box" [^>]*size=")([^"]*)(")', times, text)
+    made = scene.with_name(f"{scene.stem}_times_{factor:g}.xml")
+    made.write_text(text, encoding="utf-8")
+    return made
+
+
 def model_of(scene: Path, corners: int, spread: float = 0.0) -> Model:
     """Return the model of the object of a scene, with the scene's numbers."""
     found = mujoco.MjModel.from_xml_path(str(scene))
@@ -87,6 +104,8 @@ def model_of(scene: Path, corners: int, spread: float = 0.0) -> Model:
 def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> HandTask:
     """Return the task of a seed; start and goal are drawn as in the repository."""
     start_m, _, (first, span), sides = PLACES[scene.stem.removeprefix("env_allegro_")]
+    errors = errors_of(given.plant)
+    plant = resized(scene, errors.pop("size_factor", 1.0))
     rng = np.random.RandomState(100 + seed)
     place = np.array(start_m[:2]) + 0.005 * rng.randn(2)
     turn = first + span * float(rng.rand(1)[0])
@@ -122,9 +141,10 @@ def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
                 "timeout_s": 50.0,
             },
             "sensing": sensing_of(given.plant),
+            "costs": {"position_m": given.place, "keep_m": given.keep},
             "limits": {"speed_rad_s": given.speed},
             "plant": {
-                "kind": "mujoco", "scene": str(scene.relative_to(folder)), "body": "obj", **errors_of(given.plant),
+                "kind": "mujoco", "scene": str(plant.relative_to(folder)), "body": "obj", **errors,
             },
         }
     )  # fmt: skip
@@ -183,7 +203,9 @@ def main() -> None:
         "--touching", action=argparse.BooleanOptionalAction, default=False, help="fingers touch each other"
     )
     parser.add_argument("--horizon", type=float, default=0.4)
-    parser.add_argument("--step", type=float, default=0.01)
+    parser.add_argument("--step", type=float, default=0.015)
+    parser.add_argument("--place", type=float, default=0.015, help="error of the place that costs 1 [m]")
+    parser.add_argument("--keep", type=float, default=0.02, help="see `keep_m` of a task [m]")
     parser.add_argument("--speed", type=float, default=2.0, help="limit of targets [rad/s]; theirs: 0.2 rad a command")
     parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
     parser.add_argument("--draws", type=int, default=0, help="of friction, whose standard error is 70 %% then")
