@@ -19,12 +19,12 @@ from .horizon import Targets
 from .objective import Worlds
 from .planning import ControlState
 
-MEMBERS = 24
+MEMBERS = 32
 """States that stand for what noisy poses leave open; each is predicted from pose to pose."""
 STEP_S = 0.004
 """Largest time step of these predictions, which are as short as a command [s]."""
-DRIFT = (0.005, math.radians(9.0))
-"""Growth of a prediction's error of place [m] and turn [rad], per coordinate and root of a second: 0.7 mm and 1.3 deg
+DRIFT = (0.0035, math.radians(6.0))
+"""Growth of a prediction's error of place [m] and turn [rad], per coordinate and root of a second: 0.5 mm and 0.8 deg
 in 20 ms."""
 LONGEST_S = 0.25
 """Time without a state after which the next one is believed as it is [s]."""
