@@ -81,9 +81,8 @@ def _mask(folder: Path) -> Command:
 
 def _mask_videos(folder: Path) -> Command:
     test_mask.films(folder / "capture")
-    out = "capture/video_masks"
-    words = ["mask", str(folder / "capture"), "--empty", "empty", "--out", str(folder / out)]
-    return Command(words=words, out=(out,), check=(["validate", str(folder / out)],))
+    words = ["mask", str(folder / "capture"), "--empty", "empty", "--out", str(folder / "out")]
+    return Command(words=words, out=("out",), check=(["validate", str(folder / "out")],))
 
 
 def _target(folder: Path) -> Command:
