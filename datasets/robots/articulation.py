@@ -83,6 +83,23 @@ class JointOfRobot:
     torque_limit: float = math.inf
     """Largest torque or force of the servo [N m or N]."""
 
+    def require_possible(self, path: Path) -> None:
+        """Check that the joint of a file has an axis, and limits in their order.
+
+        Raises:
+            InputDataError: If it has not.
+        """
+        if not np.linalg.norm(self.axis) > 0:
+            raise InputDataError(
+                f"{path}: joint '{self.name}' has an axis of length 0.", "a direction.", "give it one, such as 0 0 1."
+            )
+        if self.lower > self.upper:
+            raise InputDataError(
+                f"{path}: joint '{self.name}' has the limits {self.lower:g} to {self.upper:g}.",
+                "a lower limit that is not above the upper one.",
+                "exchange them.",
+            )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Articulation:
@@ -119,6 +136,8 @@ class Articulation:
                 "leave out the joint that closes the ring.",
             )
         _require_own_names(path, [joint.name for joint in placed])
+        for joint in placed:
+            joint.require_possible(path)
         return Articulation(name=name, path=path, links=tuple(links[link] for link in order), joints=tuple(placed))
 
     def require_limits(self) -> None:

@@ -28,7 +28,7 @@ def read_mesh(path: Path) -> Mesh:
             "a closed mesh, of 4 triangles or more.",
             "export the whole surface of the body.",
         )
-    _check_closed(mesh, path)
+    require_closed(mesh, path)
     # triangles of a mesh that is inside out are flipped
     return mesh if _signed_volume(mesh) > 0 else Mesh(mesh.vertices, mesh.faces[:, ::-1])
 
@@ -131,7 +131,12 @@ def _signed_volume(mesh: Mesh) -> float:
     return float(np.linalg.det(mesh.corners()).sum() / 6)
 
 
-def _check_closed(mesh: Mesh, path: Path) -> None:
+def require_closed(mesh: Mesh, path: Path | str) -> None:
+    """Check that a mesh is closed: each edge belongs to an even number of triangles.
+
+    Raises:
+        InputDataError: If it is not, with the file or part and the number of open edges.
+    """
     _, merged = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = merged.reshape(-1)[mesh.faces]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)

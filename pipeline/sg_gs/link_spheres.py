@@ -13,7 +13,7 @@ from ...datasets.robots import Articulation, GeometryOfLink, LinkOfRobot
 from ...datasets.shapes.meshes import Mesh
 from ...schemas import InputDataError, Shape
 from ..geometry.directions import fibonacci_directions
-from ..geometry.mesh import mesh_volume
+from ..geometry.mesh import mesh_volume, require_closed
 from .collision_spheres import distil, shape_to_spheres
 
 Array = NDArray[np.float64]
@@ -66,6 +66,9 @@ def _spheres_of(path: Path, name: str, parts: Sequence[GeometryOfLink], mesh: Me
         splats, _ = shape_to_spheres(shape, path.parent, budget)
         centers = np.asarray(splats.means, float) @ parts[0].rotation.T + parts[0].position_m
         return centers, 2.0 * np.asarray(splats.scales, float)
+    for part in parts:
+        if part.mesh is not None:
+            require_closed(part.mesh, f"{path}: link '{name}'")
     try:
         spheres = distil(mesh_volume(mesh), budget)
     except InputDataError as error:

@@ -130,6 +130,8 @@ def test_an_mjcf_file_has_its_servos_anchors_and_several_joints_of_a_body(tmp_pa
         ),
         ('<sphere radius="0.03"/>', '<mesh filename="big.obj"/>', "its numbers look like millimetres"),
         ("<robot", "<sdf", "it is not XML"),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>', "joint 'rail' has an axis of length 0"),
+        ('lower="-1" upper="2"', 'lower="2" upper="-1"', "joint 'shoulder' has the limits 2 to -1"),
     ],
 )
 def test_what_a_chain_cannot_be_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -158,6 +160,13 @@ def test_what_pulls_otherwise_than_a_servo_is_refused(tmp_path: Path, joint: str
       </body></worldbody>{more}</mujoco>"""
     with pytest.raises(InputDataError, match=re.escape(message)):
         read_articulation(written(tmp_path, text, "arm.xml"))
+
+
+def test_spheres_need_a_closed_mesh(tmp_path: Path) -> None:
+    (tmp_path / "open.obj").write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\n")
+    text = ARM.replace('<sphere radius="0.03"/>', '<mesh filename="open.obj"/>', 1)
+    with pytest.raises(InputDataError, match="link 'tip': the mesh is not closed: 3 of 6 edges"):
+        link_spheres(read_articulation(written(tmp_path, text)), 60)
 
 
 def test_servos_are_given_by_joint_name_and_need_limits(tmp_path: Path) -> None:
