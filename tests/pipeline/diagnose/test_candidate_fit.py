@@ -1,6 +1,6 @@
 """Contact segments at the fit of a candidate: the same quadratic from another origin, sizes that one step misses."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData
 from cgwm.pipeline.diagnose.contact_tests.segments import SegmentsTest
 from cgwm.pipeline.diagnose.flight_equals import fitted_contact
 from cgwm.pipeline.diagnose.robust_fit import robust_fit
+from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.parameters import Parameter
 from cgwm.pipeline.segments.candidates import Candidate
@@ -73,12 +74,7 @@ def test_a_friction_that_stops_the_spin_at_once_is_found_at_its_size() -> None:
     found = SegmentsTest().evidence(data, library)
     assert found[0].name == "torsional_friction"
     assert found[0].test.estimate[0] > 0.006
-    alone = SegmentsTest()
-    linear = next(one for one in _without_fits(alone, data, library) if one.name == "torsional_friction")
+    unfitted = SegmentsTest(limits=replace(THRESHOLDS.segments, alone=()))
+    linear = next(one for one in unfitted.evidence(data, library) if one.name == "torsional_friction")
     assert found[0].score > linear.score + 50
     assert linear.test.estimate[0] < 0.5 * found[0].test.estimate[0]
-
-
-def _without_fits(test: SegmentsTest, data: ContactData, library: list[Candidate]) -> Any:
-    limits: Any = SimpleNamespace(alone=())
-    return SegmentsTest(limits=limits).evidence(data, library)
