@@ -9,6 +9,7 @@ from cgwm.pipeline.rendering.contact_sheets import (
     _window,
     compared,
     label_colors,
+    separated,
     small_png,
     telling,
 )
@@ -79,3 +80,12 @@ def test_frames_are_chosen_where_the_object_moves(late: bool) -> None:
     strip = FrameStrip(episode="a", camera="c", times_s=np.arange(12.0), real=frames, predicted=frames, masks=masks)
     chosen = telling(strip, 5)
     assert chosen[0] == 0 and chosen[-1] == 11 and sum((k > 6) == late for k in chosen) >= 3 + (not late)
+
+
+def test_separated_bodies_are_bright_on_a_dimmed_background_four_in_a_row() -> None:
+    photo, mask = np.full((30, 40, 3), 90, np.uint8), np.zeros((30, 40), bool)
+    mask[8:22, 10:30] = True
+    sheet = separated([photo] * 5, [mask] * 5, width=80)
+    assert sheet.shape == (2 * 60 + 4, 4 * 80 + 3 * 4, 3)  # as high as a photo at this width
+    assert sheet[30, 40].tolist() == [90, 90, 90] and sheet[4, 4].tolist() == [30, 30, 30]
+    assert sheet[64 + 30, 40].tolist() == [90, 90, 90] and (sheet[64:, 84:] == 255).all()
