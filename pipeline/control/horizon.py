@@ -25,8 +25,13 @@ class Targets:
 
     def at(self, times_s: Array | float) -> Array:
         """Return the targets at times (...,) [s], shape (..., joints)."""
-        columns = [np.interp(times_s, self.times_s, column) for column in self.values_m.T]
-        return np.stack(columns, -1)
+        times, values = self.times_s, self.values_m
+        if len(times) == 1:
+            return np.broadcast_to(values[0], (*np.shape(times_s), values.shape[1])).copy()
+        at = np.clip(times_s, times[0], times[-1])
+        index = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+        share = (at - times[index]) / (times[index + 1] - times[index])
+        return values[index] + share[..., None] * (values[index + 1] - values[index])
 
     def speeds(self, times_s: Array) -> Array:
         """Return the mean speeds [m/s] between times (n + 1,), shape (n, joints)."""

@@ -185,6 +185,8 @@ class PlanningController(ABC):
         inner = [time for time, _ in sent if state_s + 1e-9 < time < acts_s - 1e-9]
         times = np.array([state_s, *inner, acts_s] if acts_s > state_s + 1e-9 else [state_s])
         later = times > known.times_s[-1] + 1e-9
+        if not later.any():
+            return Targets(times_s=times, values_m=known.at(times))
         return Targets(times_s=times, values_m=np.where(later[:, None], before.at(times), known.at(times)))
 
     def _sent_from(self, first_s: float, last_s: float) -> list[tuple[float, Array]]:
