@@ -175,7 +175,8 @@ def test_shadows_change_colours_alone_and_need_a_lamp(dataset: Path, model_path:
     dark = change.min(-1) < -5
     assert dark.mean() > 0.005 and change.max() <= 1
     assert (plain.read(0, "obs/view0_mask")[dark] == 0).mean() > 0.9
-    plain.close(), shaded.close()
+    plain.close()
+    shaded.close()
 
 
 def test_crops_are_the_whole_picture(monkeypatch: pytest.MonkeyPatch) -> None:
