@@ -31,14 +31,14 @@ install: $(VENV)/linked
 demo: install
 	$(BIN)/cgwm demo $(OUT) --overwrite
 
-# One thread a process: the tensors of tests are too small to share out, and the forks share the cores. Bytecode is kept
-# whatever the environment says: without it each process of the tests compiles what it imports.
+# One thread a worker: the tensors of tests are too small to share out, and the workers share the cores. Bytecode is kept
+# whatever the environment says: without it each process of the tests compiles what it imports, a worker for five seconds.
 # The checks of the text run meanwhile, one after the other; what they print is shown after the tests. Types are checked
 # in the package: what the tests call is executed here, and 'make lint' takes half a minute more to check their types.
 test: install
 	@mkdir -p build && rm -f build/lint.log
 	@{ $(CHECKS) $(PACKAGE); } > build/lint.log 2>&1 & checks=$$!; \
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest --forks auto; tests=$$?; \
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder; tests=$$?; \
 	wait $$checks; checks=$$?; cat build/lint.log; \
 	[ $$tests = 0 ] || echo 'make test: pytest failed' >&2; [ $$checks = 0 ] || echo 'make test: ruff or pyright failed' >&2; \
 	[ $$tests = 0 ] && [ $$checks = 0 ]

@@ -11,20 +11,11 @@ import pytest
 os.environ["PYTHONSAFEPATH"] = "1"
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--forks", default="0", help="number of processes that share the tests; 'auto': all processors")
-
-
 def pytest_configure(config: pytest.Config) -> None:
-    """Watch the processor time of the tests, and share them out where that is asked for."""
-    from helpers.forks import Forks
+    """Watch the processor time of the tests."""
     from helpers.processor_time import ProcessorTime
 
-    config.pluginmanager.register(ProcessorTime(config), "processor_time")
-    asked = config.getoption("--forks")
-    count = len(os.sched_getaffinity(0)) if asked == "auto" else int(asked)
-    if count > 0:
-        config.pluginmanager.register(Forks(config, count), "forks")
+    config.pluginmanager.register(ProcessorTime(config))
 
 
 @pytest.fixture(scope="session", autouse=True)

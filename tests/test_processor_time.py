@@ -9,18 +9,23 @@ from helpers.processor_time import BUDGET_S, REFERENCE_S, ProcessorTime
 TESTPATHS = pytest.Config.ArgsSource.TESTPATHS
 
 
-def run(total_s: float, reference_s: float = REFERENCE_S, keyword: str = "") -> tuple[ProcessorTime, SimpleNamespace]:
-    """Return the plugin of a run of the whole suite, which took so long with its forks, and the session at its end."""
-    option = SimpleNamespace(keyword=keyword, markexpr="not evidence")
-    found = ProcessorTime(SimpleNamespace(option=option, args_source=TESTPATHS))
+def run(total_s: float, reference_s: float = REFERENCE_S, **changed: object) -> tuple[ProcessorTime, SimpleNamespace]:
+    """Return the plugin of a run of the whole suite, whose workers took so long, and the session at its end."""
+    option = SimpleNamespace(keyword="", markexpr="not evidence", dist="loadfile")
+    config = SimpleNamespace(option=option, args_source=TESTPATHS, **changed)
+    found = ProcessorTime(config)
     found.references_s.clear()
     for part in (0.25, 0.75):
-        found.take({"references_s": [reference_s], "most": {f"slow-{part}": part}})
+        sent = {"total_s": part * total_s, "references_s": [reference_s], "most": {f"slow-{part}": part}}
+        found.pytest_testnodedown(SimpleNamespace(workeroutput={"processor_time": sent}))
     session = SimpleNamespace(exitstatus=pytest.ExitCode.OK)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(processor_time, "spent_s", lambda: total_s)
-        found.pytest_sessionfinish(session, pytest.ExitCode.OK)
+    found.pytest_sessionfinish(session, pytest.ExitCode.OK)
     return found, session
+
+
+@pytest.fixture(autouse=True)
+def _nothing_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processor_time.time, "process_time", lambda: 0.0)
 
 
 @pytest.mark.parametrize(("total_s", "reference_s", "fails"), [
@@ -37,5 +42,8 @@ def test_a_suite_beyond_its_budget_fails(total_s: float, reference_s: float, fai
 
 
 def test_parts_of_the_suite_have_no_budget() -> None:
-    found, session = run(2 * BUDGET_S, keyword="fused")
-    assert session.exitstatus == pytest.ExitCode.OK and not found.whole()
+    _, session = run(2 * BUDGET_S, workerinput={})
+    assert session.exitstatus == pytest.ExitCode.OK
+    found, _ = run(2 * BUDGET_S)
+    found.config.option.keyword = "fused"
+    assert not found.whole()

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 BUDGET_S = 500.0
-"""Processor time that the whole suite may take, that of forks included: below five minutes of two cores."""
+"""Processor time that the whole suite may take, imports of two workers included: below five minutes of two cores."""
 REFERENCE_S = 0.018
 """What the reference computation takes beside the tests where the budget was measured, nothing else running."""
 EVERY_S = 10.0
@@ -43,7 +43,7 @@ def reference_s() -> float:
 
 
 class ProcessorTime:
-    """Plugin of pytest, in the forks that run tests and in the process that collects their results."""
+    """Plugin of pytest, in the workers and in the process that collects their results."""
 
     def __init__(self, config: pytest.Config) -> None:
         self.config = config
@@ -63,19 +63,23 @@ class ProcessorTime:
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
-        """Fail where the whole suite took more than its budget."""
-        self.total_s = spent_s()  # of forks, too, which have ended
-        if self.whole() and exitstatus == pytest.ExitCode.OK and self.comparable_s(self.total_s) > BUDGET_S:
+        """Send what a worker has seen; fail where the whole suite took more than its budget."""
+        distributed = getattr(self.config.option, "dist", "no") != "no" and not hasattr(self.config, "workerinput")
+        self.total_s += time.process_time() if distributed else spent_s()
+        if (output := getattr(self.config, "workeroutput", None)) is not None:
+            own = {"total_s": self.total_s, "references_s": self.references_s}
+            output["processor_time"] = own | {"most": dict(self.tests.most_common(SHOWN))}
+        elif self.whole() and exitstatus == pytest.ExitCode.OK and self.comparable_s(self.total_s) > BUDGET_S:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
-    def seen(self) -> dict[str, Any]:
-        """Return what a fork has seen, for `take`."""
-        return {"references_s": self.references_s, "most": dict(self.tests.most_common(SHOWN))}
-
-    def take(self, seen: dict[str, Any]) -> None:
-        """Take what a fork has seen."""
-        self.references_s += seen["references_s"]
-        self.tests.update(seen["most"])
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node: Any) -> None:
+        """Take what a worker has sent."""
+        found = getattr(node, "workeroutput", {}).get("processor_time")
+        if found is not None:
+            self.total_s += found["total_s"]
+            self.references_s += found["references_s"]
+            self.tests.update(found["most"])
 
     def comparable_s(self, seconds: float) -> float:
         """Return a processor time as the machine of the budget would have taken it."""
@@ -100,5 +104,6 @@ class ProcessorTime:
 
     def whole(self) -> bool:
         """Return whether this process reports on a run of the whole suite."""
+        worker, source = hasattr(self.config, "workerinput"), self.config.args_source
         chosen = self.config.option.keyword or self.config.option.markexpr != "not evidence"
-        return self.config.args_source is pytest.Config.ArgsSource.TESTPATHS and not chosen
+        return not worker and source is pytest.Config.ArgsSource.TESTPATHS and not chosen
