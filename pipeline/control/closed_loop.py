@@ -20,7 +20,7 @@ from torch import Tensor
 from ...datasets.capture.cameras import Camera
 from ...datasets.models.model import Model
 from ...schemas import InputDataError, NotConvergedError, UsageError, did_you_mean
-from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
+from ..geometry.rotation import quat_normalize, quat_rotate, quat_turn
 from ..physics.chain import Chain
 from ..physics.chain_state import joints_of
 from ..physics.checks import require_apart
@@ -269,7 +269,7 @@ class ClosedLoop:
         velocity = (_row(name, command.position_m, 3) - position) / length
         if command.quat_wxyz is None:
             return velocity, torch.zeros_like(velocity)
-        turn = quat_log(quat_multiply(quat_conjugate(quat), quat_normalize(_row(name, command.quat_wxyz, 4))))
+        turn = quat_turn(quat, quat_normalize(_row(name, command.quat_wxyz, 4)))
         return velocity, quat_rotate(quat, turn) / length
 
     def _advanced(self, capacity: int | None) -> _Outcome:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ..geometry.rotation import quat_turn
 from ..physics.engine import rollout
 from ..physics.joint_command import JointCommand
 from ..physics.rollout import Rollout
@@ -149,5 +149,4 @@ class HandObjective:
 
 def turn_to(quat_wxyz: Tensor, goal_wxyz: Tensor) -> Tensor:
     """Return the rotation vectors (..., 3) [rad] from orientations (..., 4) to a goal (4,), the shorter way."""
-    between = quat_multiply(quat_conjugate(goal_wxyz).expand_as(quat_wxyz), quat_wxyz)
-    return quat_log(torch.where(between[..., :1] < 0, -between, between))
+    return quat_turn(goal_wxyz, quat_wxyz)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize
+from ..geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_turn
 from ..physics.engine import rollout
 from ..physics.joint_command import JointCommand
 from ..physics.world import State
@@ -169,12 +169,12 @@ class HandTracker:
     def _filtered(self, found: _Ensemble, position_m: Tensor, quat_wxyz: Tensor) -> _Ensemble:
         """Return predicted states after a measured pose (1, ...), by the gains of the ensemble's covariance."""
         middle = found.mean[1]
-        rows = torch.cat((found.position_m, _turn(middle, found.quat_wxyz), found.velocity_m_s,
+        rows = torch.cat((found.position_m, quat_turn(middle, found.quat_wxyz), found.velocity_m_s,
                           found.omega_body_rad_s), -1).numpy()  # fmt: skip
         size = np.repeat(self._noise, 3)
         covariance = np.cov(rows.T)
         gain = np.linalg.solve(covariance[:6, :6] + np.diag(size**2), covariance[:6]).T
-        seen = torch.cat((position_m, _turn(middle, quat_wxyz)), -1).numpy()
+        seen = torch.cat((position_m, quat_turn(middle, quat_wxyz)), -1).numpy()
         errors = size * self._rng.normal(size=(len(rows), 6))
         rows = torch.as_tensor(rows + (seen + errors - errors.mean(0) - rows[:, :6]) @ gain.T)
         quat = quat_multiply(middle.expand(len(rows), 4), quat_exp(rows[:, 3:6]))
@@ -186,7 +186,7 @@ class HandTracker:
         """Count how well each draw predicted a pose."""
         size2 = self._noise**2 + np.square(DRIFT) * gone_s
         place, aim = _pose(state)
-        away, turn = position - place, _turn(quat, aim)
+        away, turn = position - place, quat_turn(quat, aim)
         square = (away.square().sum(-1) / size2[0] + turn.square().sum(-1) / size2[1]).numpy()
         each = 0.5 * (DEGREES + 6) * np.log1p(np.nan_to_num(square, nan=1e6) / DEGREES)
         self._disagreement = self._disagreement * math.exp(-gone_s / MEMORY_S) + each
@@ -205,11 +205,5 @@ def _followed(found: _Ensemble, position_m: Tensor, quat_wxyz: Tensor, gone_s: f
         position_m=position_m,
         quat_wxyz=quat_wxyz,
         velocity_m_s=found.velocity_m_s + (position_m - found.position_m) / gone_s,
-        omega_body_rad_s=found.omega_body_rad_s + _turn(found.quat_wxyz, quat_wxyz) / gone_s,
+        omega_body_rad_s=found.omega_body_rad_s + quat_turn(found.quat_wxyz, quat_wxyz) / gone_s,
     )
-
-
-def _turn(quat_wxyz: Tensor, to_wxyz: Tensor) -> Tensor:
-    """Return the rotation vectors (..., 3) [rad] from orientations to others, body frame, the shorter way."""
-    between = quat_multiply(*torch.broadcast_tensors(quat_conjugate(quat_wxyz), to_wxyz))
-    return quat_log(torch.where(between[..., :1] < 0, -between, between))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ...schemas import JOINTS, NotConvergedError, PlannerSection, UsageError
-from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from ..geometry.rotation import quat_exp, quat_multiply, quat_turn
 from ..physics.fused.host import lacking
 from ..runtime.resources import one_torch_thread
 from .horizon import Array, Forecast, Targets
@@ -61,7 +61,7 @@ class ControlState:
             return None if first is None or second is None else mean(first, second)
 
         first, second = torch.as_tensor(self.quat_wxyz), torch.as_tensor(other.quat_wxyz)
-        turn = quat_log(quat_multiply(quat_conjugate(first), second * torch.sign((first * second).sum())))
+        turn = quat_turn(first, second)
         return ControlState(
             time_s=(1 - share) * self.time_s + share * other.time_s,
             joints=means(self.joints, other.joints) or {},

@@ -83,6 +83,11 @@ def quat_log(quat_wxyz: Tensor) -> Tensor:
     return factor * vector
 
 
+def quat_turn(from_wxyz: Tensor, to_wxyz: Tensor) -> Tensor:
+    """Return the shortest rotation vectors (..., 3) [rad] from orientations (..., 4) to others, axes of the former."""
+    return quat_log(quat_multiply(quat_conjugate(from_wxyz), to_wxyz))
+
+
 def continuous_turns(
     times_s: Tensor, quat_wxyz: Tensor, known: Tensor | None = None, reference: Tensor | None = None
 ) -> Tensor:
@@ -102,7 +107,7 @@ def continuous_turns(
     known = torch.ones_like(times_s) if known is None else known
     reference = torch.zeros_like(times_s[..., 0], dtype=torch.long) if reference is None else reference
     both = known[..., 1:] * known[..., :-1]
-    steps = quat_log(quat_multiply(quat_conjugate(quat_wxyz[..., :-1, :]), quat_wxyz[..., 1:, :])) * both[..., None]
+    steps = quat_turn(quat_wxyz[..., :-1, :], quat_wxyz[..., 1:, :]) * both[..., None]
     span = (times_s.diff(dim=-1) * both).sum(-1, keepdim=True).clamp_min(1e-12)
     spin, speed = steps.sum(-2) / span, steps.norm(dim=-1).sum(-1, keepdim=True) / span
     base = quat_wxyz.gather(-2, reference[..., None, None].expand(*reference.shape, 1, 4))
@@ -136,4 +141,4 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 
 def geodesic_angle(a_wxyz: Tensor, b_wxyz: Tensor) -> Tensor:
     """Return the angle [rad] (...) of the rotation that takes a to b, both unit quaternions (..., 4)."""
-    return quat_log(quat_multiply(quat_conjugate(a_wxyz), b_wxyz)).square().sum(-1).sqrt()
+    return quat_turn(a_wxyz, b_wxyz).square().sum(-1).sqrt()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...schemas import InputDataError
-from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from ..geometry.rotation import quat_exp, quat_multiply, quat_rotate, quat_turn
 from .joint_command import JointCommand
 from .rigid_body import Motion
 
@@ -134,7 +134,7 @@ def _prepare(track: Track, longest: int, like: Tensor) -> tuple[Tensor, ...]:
     else:
         quat = torch.as_tensor(track.quat_wxyz).to(like)
     length = times.diff()[:, None]
-    turn = quat_log(quat_multiply(quat_conjugate(quat[:-1]), quat[1:]))
+    turn = quat_turn(quat[:-1], quat[1:])
     velocity, omega = position.diff(dim=0) / length, quat_rotate(quat[:-1], turn) / length
     still = torch.zeros(1, 3).to(like)
     padding = longest - len(times)

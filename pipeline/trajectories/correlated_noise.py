@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ..geometry.rotation import quat_turn
 from ..optimization.levenberg_marquardt import Solution
 from .innovations import MOST_NUMBERS, RESOLUTION_S, WHITE, CorrelatedNoise, NoiseModel, matern
 from .observations import Observations
@@ -266,10 +266,7 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int, std: flo
                     values = whole.position_m[segment.episode, chosen, column].numpy()[:, axes]
                 else:
                     quat = whole.quat_wxyz[segment.episode, chosen, column]
-                    values, axes = (
-                        quat_log(quat_multiply(quat_conjugate(quat[length // 2]), quat)).numpy(),
-                        np.ones(3, bool),
-                    )
+                    values, axes = quat_turn(quat[length // 2], quat).numpy(), np.ones(3, bool)
                 timed: tuple[Array, ...] = ()
                 if whole.time_shift is not None:
                     shift = whole.time_shift[segment.episode, chosen, column, 3 * kind : 3 * kind + 3].numpy()[:, axes]
@@ -291,7 +288,7 @@ def _window(whole: Observations, episode: int, column: int, frames: Tensor, kind
     spin = 0.0
     if len(known) > 1:
         quat = whole.quat_wxyz[episode, known, column]
-        turns = quat_log(quat_multiply(quat_conjugate(quat[:-1]), quat[1:])).norm(dim=-1)
+        turns = quat_turn(quat[:-1], quat[1:]).norm(dim=-1)
         spin = float((turns / whole.times_s[episode, known].diff()).median())
     longest = min(LONGEST_S, LARGEST_TURN / max(spin, 1e-9)) if kind else LONGEST_S
     number = max(1, -(-float(times[-1] - times[0]) // longest))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..geometry.rotation import quat_conjugate, quat_exp, quat_log, quat_multiply
+from ..geometry.rotation import quat_exp, quat_multiply, quat_turn
 from ..optimization.forward_mode import batched_jacobian
 from ..physics.chain_state import on_joints
 from ..physics.engine import length_groups, ragged_rollout
@@ -167,7 +167,7 @@ class TrajectoryResiduals:
         position, quat = (x[:, :, bodies].unflatten(0, (repeats, -1)) for x in (rollout.position_m, rollout.quat_wxyz))
         moved = self._weighted(position - seen.position_m[:, :frames], seen.seen, self.position_std_m)
         if bool(seen.has_orientation[:, :frames].any()):
-            turn = quat_log(quat_multiply(quat_conjugate(seen.quat_wxyz[:, :frames]), quat))
+            turn = quat_turn(seen.quat_wxyz[:, :frames], quat)
             turned = self._weighted(turn, seen.has_orientation, self.rotation_std_rad)
         else:
             turned = torch.zeros_like(moved)

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ..geometry.rotation import quat_turn
 from .innovations import WHITE, NoiseModel, body_innovations
 from .observations import Observations
 from .segmentation import Segment
@@ -145,7 +145,7 @@ def _faster(whole: Observations, kind: int) -> Tensor:
         steps = whole.times_s[episode, frames].diff().clamp_min(1e-9)[:, None]
         if kind:
             quat = whole.quat_wxyz[episode, frames, body]
-            moved = quat_log(quat_multiply(quat_conjugate(quat[:-1]), quat[1:]))
+            moved = quat_turn(quat[:-1], quat[1:])
         else:
             moved = whole.position_m[episode, frames, body].diff(dim=0)
         rates = moved / steps

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ....datasets.io.progress import progress
-from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ...geometry.rotation import quat_turn
 from ...optimization.least_squares import Descent, Policy, Stop, descend
 from ...optimization.levenberg_marquardt import robust_loss
 from ...optimization.problem import Box, NormalEquations, Point, Problem, Rows
@@ -181,7 +181,7 @@ class ImageObjective:
             with torch.no_grad():
                 moved = self._rolled(rows[:, : len(shared)], rows[:, len(shared) :], some)
             here = [rollout.position_m[some][:, :, free], rollout.quat_wxyz[some][:, :, free]]
-            turn = quat_log(quat_multiply(quat_conjugate(here[1]), moved.quat_wxyz[:, :, free]))
+            turn = quat_turn(here[1], moved.quat_wxyz[:, :, free])
             columns.append(torch.cat([moved.position_m[:, :, free] - here[0], turn], -1).flatten(2))
         slopes = torch.cat(columns).unflatten(0, (batch, len(steps))) / steps[:, None, None]
         return torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(1, -1)
@@ -229,7 +229,7 @@ class ImageObjective:
 
 def _difference(poses: Observations, measured: Observations) -> Tensor:
     """Return the difference of poses from measured ones (B, T, nf, 6): shift [m], rotation vector [rad]."""
-    turn = quat_log(quat_multiply(quat_conjugate(measured.quat_wxyz), poses.quat_wxyz))
+    turn = quat_turn(measured.quat_wxyz, poses.quat_wxyz)
     return torch.cat([poses.position_m - measured.position_m, turn], -1)
 
 

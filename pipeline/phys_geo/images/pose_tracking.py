@@ -23,7 +23,7 @@ from torch import Tensor
 
 from ....datasets.io.progress import progress
 from ....schemas import NotConvergedError
-from ...geometry.rotation import geodesic_angle, quat_conjugate, quat_exp, quat_log, quat_multiply
+from ...geometry.rotation import geodesic_angle, quat_exp, quat_multiply, quat_turn
 from ...trajectories.track_noise import Noise
 from .image_loss import ImageLoss, PoseQuality
 from .pose_descent import Poses, descended
@@ -225,7 +225,7 @@ class PoseTracker:
                 step = self._times[last.instant] - self._times[last.before_instant]
                 ratio = float((self._times[instant] - self._times[last.instant]) / step)
                 shift = position[:, index] - last.before.position_m[:, index]
-                turn = quat_log(quat_multiply(quat_conjugate(last.before.quat_wxyz[:, index]), quat[:, index]))
+                turn = quat_turn(last.before.quat_wxyz[:, index], quat[:, index])
                 position[:, index] = position[:, index] + ratio * shift
                 quat[:, index] = quat_multiply(quat[:, index], quat_exp(ratio * turn))
         return position, quat

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ....datasets.capture.tracks import Episode
-from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from ...geometry.rotation import quat_turn
 from ...optimization.problem import NormalEquations
 from ...physics.world import State, World
 from ...trajectories.initial_state import FLIGHT_MARGIN_M, clearance, separate_frames
@@ -198,7 +198,7 @@ def _informative(world: World, whole: Observations, pieces: Sequence[_Piece], no
     moved = whole.position_m.new_zeros(len(pieces))
     for row, (k, a, b) in enumerate(pieces):
         shift = (whole.position_m[k, b] - whole.position_m[k, a]).abs().amax() / noise.position_m
-        turn = quat_log(quat_multiply(quat_conjugate(whole.quat_wxyz[k, a]), whole.quat_wxyz[k, b]))
+        turn = quat_turn(whole.quat_wxyz[k, a], whole.quat_wxyz[k, b])
         moved[row] = torch.maximum(shift, turn.abs().amax() / noise.rotation_rad)
     touches = [not bool(flying[k, a : b + 1].all()) for k, a, b in pieces]
     moving = [touch and bool(way > RESTING_SIGMAS) for touch, way in zip(touches, moved, strict=True)]
@@ -232,7 +232,7 @@ def _moving(world: World, whole: Observations, items: list[int], starts: list[in
                 shift = whole.position_m[item, other, column] - whole.position_m[item, frame, column]
                 here, there = whole.quat_wxyz[item, frame, column], whole.quat_wxyz[item, other, column]
                 rates.append(shift / span - (0.0 if fall is None else 0.5 * span * fall))
-                turns.append(quat_log(quat_multiply(quat_conjugate(here), there)) / span)
+                turns.append(quat_turn(here, there) / span)
             velocity[row, body] = torch.stack(rates).mean(0)
             if bool(whole.has_orientation[item, frame, column]):  # else the spin is that of the first guess
                 omega[row, body] = torch.stack(turns).mean(0)
