@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ...schemas import Ground, GroundShadow, ModelFile
+from ..geometry.ground_spheres import NODE_WEIGHTS, NODES, dimmed, on_plane
 from .posed_scene import Labelled
 from .render import render
 
@@ -23,8 +24,6 @@ _FAR = 1000.0
 """Distance of the lamp, in radii of the body: its rays are parallel to 0.1 %."""
 _MARGIN = 3.0
 """Standard deviations of a sphere that belong to the radius of its body."""
-_THIN = 2.0
-"""Spheres whose centres are within this many of their scales of the plane belong to the ground."""
 _LARGEST_M = 0.1
 """Largest scale of a sphere of the ground [m]; larger ones are backdrop."""
 _FRAMES = 32
@@ -61,15 +60,13 @@ class ShadedGround:
 
     def __init__(self, shadow: GroundShadow, ground: Ground, still: Labelled) -> None:
         normal = still.means.new_tensor(ground.normal)
-        away = (still.means @ normal - ground.offset_m).abs()
-        of_ground = (still.labels == 0) & (away < _THIN * still.scales) & (still.scales < _LARGEST_M)
-        self.rows = of_ground.nonzero()[:, 0]
+        of_ground = on_plane(still.means, normal, ground.offset_m, still.scales, _LARGEST_M)
+        self.rows = (of_ground & (still.labels == 0)).nonzero()[:, 0]
         """Which of the still spheres are shaded, shape (R,)."""
         self._to_lamp = still.means.new_tensor(shadow.to_lamp)
         self._factors = still.means.new_tensor(shadow.brightness_rgb)
         self._axes = _across(self._to_lamp)
-        steps = 3**0.5 * still.means.new_tensor([-1.0, 0.0, 1.0])  # Gauss-Hermite, 3 nodes a side
-        weights = still.means.new_tensor([1.0, 4.0, 1.0]) / 6
+        steps, weights = still.means.new_tensor(NODES), still.means.new_tensor(NODE_WEIGHTS)
         along = _across(normal)[:2]
         offsets = torch.cartesian_prod(steps, steps) @ along
         self._weights = torch.outer(weights, weights).flatten()
@@ -84,7 +81,7 @@ class ShadedGround:
             for first in range(0, count, _FRAMES):
                 part = replace(spheres, means=spheres.means[first : first + _FRAMES])
                 lit[first : first + _FRAMES] *= 1 - self._cover(part)
-        return 1 - (1 - lit @ self._weights)[..., None] * (1 - self._factors)
+        return dimmed(1 - lit @ self._weights, self._factors)
 
     def shaded(self, still: Labelled, dimming: Tensor) -> Labelled:
         """Return the still spheres with the colours of the ground times factors (..., R, 3)."""

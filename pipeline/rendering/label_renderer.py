@@ -113,7 +113,6 @@ class LabelRenderer:
     def set_cameras(self, cameras: Mapping[str, Camera]) -> None:
         """Replace the cameras."""
         self._views = {name: self._view(camera) for name, camera in cameras.items()}
-        self.set_shadow(self._shadow)
 
     def set_light(self, light: Light | None) -> None:
         """Set the light that shades moving bodies; None keeps the colours of the photos."""
@@ -121,9 +120,8 @@ class LabelRenderer:
 
     def set_shadow(self, shadow: GroundShadow | None) -> None:
         """Set the shadow that moving bodies cast on the ground; None for none."""
-        self._shadow, self._shaded = shadow, None
-        if shadow is not None and self._ground is not None and self._views:
-            self._shaded = ShadedGround(shadow, self._ground, next(iter(self._views.values())).still)
+        if shadow != self._shadow:
+            self._shadow, self._shaded = shadow, None
 
     @torch.no_grad()
     def blocks(
@@ -141,6 +139,9 @@ class LabelRenderer:
             wait: Whether to wait for the device; otherwise the reader of a block calls its `ready` first.
             exposures: Exposures of some cameras; the others show the model's colours.
         """
+        if self._shaded is None and self._shadow is not None and self._ground is not None and self._views:
+            # any camera serves: spheres that never move lie where they lie
+            self._shaded = ShadedGround(self._shadow, self._ground, next(iter(self._views.values())).still)
         at_once = self._frames_at_once() if self._together else CHUNK_FRAMES
         for first in range(0, len(position_m), at_once):
             placed = self._scene.placed(position_m[first : first + at_once], quat_wxyz[first : first + at_once])

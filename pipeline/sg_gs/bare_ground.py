@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ...datasets.io.progress import note
 from ...schemas import GroundShadow
+from ..geometry.ground_spheres import NODE_WEIGHTS, NODES, dimmed, on_plane
 from ..geometry.solid_grid import Array
 from ..geometry.spheres import Spheres
 from .cast_shadow import CastShadow, find_shadow
@@ -25,8 +26,6 @@ from .context import Stage
 from .ground_photo import CELLS, GroundPhoto, photograph_ground
 from .initialization import to_spheres
 
-_THIN = 2.0
-"""Spheres whose centres are within this many of their scales of the plane belong to the ground."""
 _LARGEST = 0.15
 """Largest scale of a sphere of the ground, of the side of the grid; larger ones are backdrop."""
 _INPAINT_CELLS = 5
@@ -61,7 +60,7 @@ def bare_ground(stage: Stage, scene: Spheres, bodies: list[Spheres]) -> BareGrou
         return BareGround(scene, None)
     shadow = find_shadow(photo, solid)
     hidden = _hidden(photo, solid)
-    lit = photo.colors if shadow is None else photo.colors / _dimming(shadow.cover, shadow.factors)
+    lit = photo.colors if shadow is None else photo.colors / dimmed(shadow.cover, shadow.factors).astype(np.float32)
     bare = _inpainted(lit, photo.seen, hidden)
     if shadow is not None:
         scene = _lifted(scene, photo, shadow)
@@ -99,11 +98,6 @@ def _hidden(photo: GroundPhoto, bodies: list[Array]) -> NDArray[np.bool_]:
     return ~closed & near
 
 
-def _dimming(cover: NDArray[np.float32], factors: Array) -> NDArray[np.float32]:
-    """Return by how much a shadow dims places that it covers in part, shape (..., 3)."""
-    return (1 - cover[..., None] * (1 - factors)).astype(np.float32)
-
-
 def _inpainted(colors: NDArray[np.float32], seen: NDArray[np.bool_], hidden: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the colours (CELLS, CELLS, 3) with hidden cells filled from their surroundings (Telea, 2004)."""
     picture = np.clip(255 * colors, 0, 255).astype(np.uint8)
@@ -119,13 +113,12 @@ def _lifted(scene: Spheres, photo: GroundPhoto, shadow: CastShadow) -> Spheres:
     """
     means, scales = scene.means.detach().cpu().numpy().astype(float), scene.scales.detach().cpu().numpy().astype(float)
     ground = _of_ground(means, scales, photo)
-    steps, weights = np.sqrt(3) * np.array([-1.0, 0.0, 1.0]), np.array([1.0, 4.0, 1.0]) / 6  # Gauss-Hermite, 3 nodes
     cover = np.zeros(len(scales))
-    for i, u in enumerate(steps):
-        for j, v in enumerate(steps):
+    for i, u in enumerate(NODES):
+        for j, v in enumerate(NODES):
             places = photo.places(means) + (scales / photo.cell)[:, None] * [u, v]
-            cover += weights[i] * weights[j] * _at(shadow.cover, places)
-    dimming = _dimming((cover * ground).astype(np.float32), shadow.factors)
+            cover += NODE_WEIGHTS[i] * NODE_WEIGHTS[j] * _at(shadow.cover, places)
+    dimming = dimmed((cover * ground).astype(np.float32), shadow.factors).astype(np.float32)
     return _brightened(scene, torch.as_tensor(dimming).to(scene.colors))
 
 
@@ -135,8 +128,7 @@ def _brightened(scene: Spheres, dimming: Tensor) -> Spheres:
 
 
 def _of_ground(means: Array, scales: Array, photo: GroundPhoto) -> NDArray[np.bool_]:
-    away = np.abs(means @ photo.axes[2] - photo.height)
-    return (away < _THIN * scales) & (scales < _LARGEST * CELLS * photo.cell)
+    return on_plane(means, photo.axes[2], photo.height, scales, _LARGEST * CELLS * photo.cell)
 
 
 def _at(grid: NDArray[np.float32], places: Array) -> Array:
