@@ -56,8 +56,7 @@ class Controller(PlanningController):
     ) -> None:
         model = model if isinstance(model, Model) else read_model(model)
         task = task if isinstance(task, ControlTask) else read_task(Path(task))
-        if draws < 0:
-            raise UsageError(f"{draws} draws.", "0 or more.", todo="give 0 for the mean parameters, or more.")
+        require_draws(draws)
         self.task_world: TaskWorld = task_world(model, task)
         self.task = task
         where = str(resolve_device(device))
@@ -101,6 +100,12 @@ class Controller(PlanningController):
             given_m_s=speeds[: horizon.given],
         )
         return objective, torch.as_tensor(speeds[horizon.given :])
+
+
+def require_draws(draws: int) -> None:
+    """Refuse a negative number of draws."""
+    if draws < 0:
+        raise UsageError(f"{draws} draws.", "0 or more.", todo="give 0 for the mean parameters, or more.")
 
 
 def drawn_worlds(model: Model, draws: int, seed: int, device: str, planned: Callable[[Model | None], World]) -> Worlds:

@@ -14,7 +14,7 @@ from ...datasets.models.model import Model, read_model
 from ...schemas import HandTask, SolverName, UsageError, read_hand_task
 from ..physics.world import World
 from ..runtime.device import resolve_device
-from .controller import drawn_worlds
+from .controller import drawn_worlds, require_draws
 from .elites import Elites
 from .hand_objective import HandObjective
 from .hand_tracker import LONGEST_S, STEP_S, HandTracker
@@ -55,8 +55,7 @@ class HandController(PlanningController):
     ) -> None:
         model = model if isinstance(model, Model) else read_model(model)
         task = task if isinstance(task, HandTask) else read_hand_task(Path(task))
-        if draws < 0:
-            raise UsageError(f"{draws} draws.", "0 or more.", todo="give 0 for the mean parameters, or more.")
+        require_draws(draws)
         self.hand: HandWorld = hand_world(model, task)
         self.task = task
         self.goal_wxyz = np.array(task.start.quat_wxyz)

@@ -13,6 +13,7 @@ from ...schemas import AnyTask, ControlResult, ControlRun, ControlTask, HandTask
 from ..report.page import cautions, facts, film, fixed, folded, number, page, paragraph, section, table, text, way_link
 from ..report.plots import Plot, Series, legend, plot_svg
 from .film import AHEAD_S
+from .tables import contact_force
 
 PAGE, FILM = "control.html", "run.webm"
 MOST_POINTS = 400
@@ -174,9 +175,7 @@ def _forces(runs: Sequence[PageRun]) -> list[str]:
     """Return the contact force over time."""
     lines, hand = [], "control/grip" in runs[0].tables.arrays
     for index, run in enumerate(runs[:MOST_LINES]):
-        arrays = run.tables.arrays
-        force = arrays["control/grip"] if hand else np.linalg.norm(arrays["control/force"], axis=-1)
-        points = _thinned(run.tables.arrays["control/time"], force)
+        points = _thinned(run.tables.arrays["control/time"], contact_force(run.tables.arrays))
         lines.append(Series(name=f"seed {run.figures.seed}", points=points, color=f"m{index % 6}"))
     told = "Sum of the sizes of all forces on the object" if hand else "Of the finger on the object"
     told = paragraph(f"{told}, mean over a command.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from ...datasets.rollouts.control_file import RunTables
@@ -87,7 +89,6 @@ def figures_of(recording: Recording, tables: RunTables, start: tuple[float, floa
     wall, cpu = (1e3 * recording.column(name, "plans") for name in ("wall_s", "cpu_s"))
     errors = (arrays["control/position_error"], arrays["control/turn_error"])
     last = tuple(float(values[-1]) if len(values) else first for values, first in zip(errors, start, strict=True))
-    force = arrays["control/grip"] if "control/grip" in arrays else np.linalg.norm(arrays["control/force"], axis=-1)
     return ControlRun(
         seed=recording.seed,
         ended=recording.ended,
@@ -104,5 +105,10 @@ def figures_of(recording: Recording, tables: RunTables, start: tuple[float, floa
         plan_ms=float(np.median(wall)) if len(wall) else 0.0,
         plan_ms_95=float(np.percentile(wall, 95)) if len(wall) else 0.0,
         plan_cpu_ms=float(np.median(cpu)) if len(cpu) else 0.0,
-        largest_force_n=float(force.max(initial=0.0)),
+        largest_force_n=float(contact_force(arrays).max(initial=0.0)),
     )
+
+
+def contact_force(arrays: Mapping[str, Array]) -> Array:
+    """Return the size of the contact force on the object (commands,) [N]; of a hand the sum of all."""
+    return arrays["control/grip"] if "control/grip" in arrays else np.linalg.norm(arrays["control/force"], axis=-1)
