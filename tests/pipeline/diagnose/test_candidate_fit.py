@@ -12,31 +12,16 @@ from cgwm.pipeline.diagnose.flight_equals import fitted_contact
 from cgwm.pipeline.diagnose.robust_fit import robust_fit
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.physics.effects import load_effect
-from cgwm.pipeline.physics.parameters import Parameter
 from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.linearization import Linearization
 from cgwm.pipeline.segments.prepare import prepare
 from helpers.diagnosis_data import tosses, world_with
+from helpers.quadratic_segments import quadratic_segments
 
 
 def quadratics(rows: Any, seen: Any) -> Linearization:
     """Segments with residuals `seen` and slopes `rows`; the second parameter is one of a candidate."""
-    count = len(rows)
-    parameters = tuple(
-        Parameter(name=n, unit="1", prior=(0.0, 1e6), bounds=(-9.0, 9.0), logarithmic=False, reveals="") for n in "fe"
-    )
-    return Linearization(
-        parameters=parameters,
-        base=1,
-        information=np.einsum("bti,btj->bij", rows, rows),
-        score=np.einsum("bti,bt->bi", rows, seen),
-        weight=np.ones(count),
-        episode=np.arange(count),
-        group=np.zeros(count, np.int64),
-        prior=np.zeros(2),
-        chi2=(seen**2).sum(1),
-        dof=np.full(count, 20.0),
-    )
+    return quadratic_segments(rows, seen, np.arange(len(rows)), 1e6, np.zeros(2))
 
 
 def test_a_linearization_at_a_fit_is_that_of_the_same_rows_at_the_origin() -> None:

@@ -22,6 +22,7 @@ from cgwm.pipeline.segments.linearization import Linearization
 from cgwm.pipeline.segments.slow_errors import SlowErrors
 from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, NoiseModel
 from helpers.diagnosis_data import evidence_of
+from helpers.quadratic_segments import quadratic_segments
 from numpy.typing import NDArray
 
 
@@ -31,21 +32,7 @@ def linear(effect: NDArray[np.float64], noise: float = 1.0) -> Linearization:
     episode = np.arange(count) % len(effect)
     rows = rng.standard_normal((count, 30, 2))
     seen = rows @ [0.3, 0.0] + rows[..., 1] * effect[episode, None] + noise * rng.standard_normal((count, 30))
-    parameters = tuple(
-        Parameter(name=n, unit="1", prior=(0.0, 5.0), bounds=(-9.0, 9.0), logarithmic=False, reveals="") for n in "fe"
-    )
-    return Linearization(
-        parameters=parameters,
-        base=1,
-        information=np.einsum("bti,btj->bij", rows, rows),
-        score=np.einsum("bti,bt->bi", rows, seen),
-        weight=np.ones(count),
-        episode=episode,
-        group=np.zeros(count, np.int64),
-        prior=np.array([1 / 25, 0.0]),
-        chi2=(seen**2).sum(1),
-        dof=np.full(count, 30.0),
-    )
+    return quadratic_segments(rows, seen, episode, 5.0, np.array([1 / 25, 0.0]))
 
 
 def test_an_effect_of_all_episodes_repeats_and_one_episodes_does_not() -> None:
