@@ -93,42 +93,50 @@ def poses_of(model: Model, photo_qpos: np.ndarray, qpos: np.ndarray) -> tuple[np
     return position[:, None], np.stack([quat_from_matrix(R @ turn) for R in turns])[:, None]
 
 
+def scores(picture: np.ndarray, truth: np.ndarray, flat: np.ndarray, label: np.ndarray) -> tuple[float, float | None]:
+    """Return the PSNR [dB] of a picture in the frame, and in the shadow on the ground; None without one."""
+    shaded = np.abs(truth - flat).max(-1) > 1 / 255
+    ground, lit = label == 0, (label == 0) & ~shaded
+    even = picture * (truth[lit].sum(0) / picture[lit].sum(0))
+    cast = shaded & ground
+    return psnr(truth, even), psnr(truth[cast], even[cast]) if cast.sum() > 20 else None
+
+
 def measure_model(path: Path, name: str, seed: int, frames: int) -> dict[str, Any]:
     """Return medians over frames of all cameras and test episodes of a scene."""
     model, plan = read_model(path), plan_scene(name, seed)
-    scenes = [build_set(plan, (64, 48), (320, 240), 3) for _ in range(2)]
-    unshaded(scenes[1])
-    figures: dict[str, list[float]] = {key: [] for key in ("whole", "inside")}
-    gains, seconds = {"without": figures, "with": {key: [] for key in figures}}, {"without": 0.0, "with": 0.0}
-    for camera_name, filmed in scenes[0].videos.items():
-        camera = replace(filmed, distortion=np.zeros(0))
-        empty = _empty(scenes[0], camera)
-        for episode in [one for one in plan.episodes if one.split == "test"]:
-            times = np.linspace(0, episode.frame_count - 1, frames).astype(int) / plan.frame_rate
-            qpos = episode.motion.qpos[[episode.motion.row(time) for time in times]]
-            truths = [frame_of(scenes[0], camera, episode.motion, time, empty) for time in times]
-            flats = [frame_of(scenes[1], camera, episode.motion, time, empty)[0] for time in times]
-            for kind, shadow in (("without", None), ("with", shadow_of(model.file))):
-                renderer = LabelRenderer(model, {camera_name: camera}, shadow=shadow)
-                begun = time_ns()
-                blocks = list(renderer.blocks(*poses_of(model, plan.photo_qpos, qpos[:, :7])))
-                seconds[kind] += (time_ns() - begun) / 1e9
-                pictures = np.concatenate([block.image for block in blocks]) / 255
-                for picture, (truth, label), flat in zip(pictures, truths, flats, strict=True):
-                    lit = (label == 0) & (np.abs(truth - flat).max(-1) < 1 / 255)
-                    seen = picture * (truth[lit].sum(0) / picture[lit].sum(0))
-                    cast = (np.abs(truth - flat).max(-1) > 1 / 255) & (label == 0)
-                    gains[kind]["whole"].append(psnr(truth, seen))
-                    if cast.sum() > 20:
-                        gains[kind]["inside"].append(psnr(truth[cast], seen[cast]))
-    counted = len(figures["whole"])
+    shaded, flat = (build_set(plan, (64, 48), (320, 240), 3) for _ in range(2))
+    unshaded(flat)
+    kinds = {"without": None, "with": shadow_of(model.file)}
+    found: dict[str, list[tuple[float, float | None]]] = {kind: [] for kind in kinds}
+    seconds = dict.fromkeys(kinds, 0.0)
+    films = [(key, film, one) for key, film in shaded.videos.items() for one in plan.episodes if one.split == "test"]
+    for key, film, episode in films:
+        camera = replace(film, distortion=np.zeros(0))
+        empty, times = _empty(shaded, camera), np.linspace(0, episode.frame_count - 1, frames).astype(int)
+        drawn = [
+            [frame_of(scene, camera, episode.motion, time, empty) for time in times / plan.frame_rate]
+            for scene in (shaded, flat)
+        ]
+        qpos = episode.motion.qpos[[episode.motion.row(time) for time in times / plan.frame_rate]]
+        for kind, shadow in kinds.items():
+            renderer = LabelRenderer(model, {key: camera}, shadow=shadow)
+            begun = time_ns()
+            blocks = list(renderer.blocks(*poses_of(model, plan.photo_qpos, qpos[:, :7])))
+            seconds[kind] += (time_ns() - begun) / 1e9
+            pictures = np.concatenate([block.image for block in blocks]) / 255
+            found[kind] += [
+                scores(picture, truth, plain, label)
+                for picture, (truth, label), (plain, _) in zip(pictures, *drawn, strict=True)
+            ]
+    inside = {kind: np.array([one[1] for one in some if one[1] is not None]) for kind, some in found.items()}
     return {
-        "frames": counted,
-        **{f"whole_frame_{k}_db": float(np.median(v["whole"])) for k, v in gains.items()},
-        **{f"in_the_shadow_{k}_db": float(np.median(v["inside"])) for k, v in gains.items()},
-        "better_frames": int((np.array(gains["with"]["inside"]) > gains["without"]["inside"]).sum()),
-        "frames_with_a_shadow": len(gains["with"]["inside"]),
-        **{f"ms_a_frame_{kind}": 1e3 * spent / counted for kind, spent in seconds.items()},
+        "frames": len(found["with"]),
+        **{f"whole_frame_{kind}_db": float(np.median([one[0] for one in some])) for kind, some in found.items()},
+        **{f"in_the_shadow_{kind}_db": float(np.median(some)) for kind, some in inside.items()},
+        "better_frames": int((inside["with"] > inside["without"]).sum()),
+        "frames_with_a_shadow": len(inside["with"]),
+        **{f"ms_a_frame_{kind}": 1e3 * spent / len(found[kind]) for kind, spent in seconds.items()},
     }
 
 
