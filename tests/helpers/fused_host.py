@@ -2,6 +2,7 @@
 
 The threads of a warp are fibres that take turns: each runs to its next exchange with the others. As on a GPU, several
 environments share a warp, and all of its threads must take part in each exchange, at the same place of the program.
+Environments begin in memory that is filled with what no number or index is, and a place outside of the arrays is told.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ SHIM = r"""
 #include <cmath>
 #include <cstdio>
 #include <csetjmp>
+#include <csignal>
 #include <cstdlib>
 #include <ucontext.h>
 #define __device__
@@ -114,14 +116,24 @@ __attribute__((noinline)) static bool __any_sync(unsigned, bool mine) {
 ENTRY = r"""
 static const Problem* shared_problem;
 static int first_environment;
+#if SHARED
+static Environment copies[32 / LANES];
+#endif
+
+// Fills memory with what no number is and no index may be. What is read before it is set is then seen: a GPU's memory
+// holds what ran before, that of a CPU is mostly zero.
+static void fill_unset(void* room, unsigned long bytes) {
+    const int unset = 0x7fffffff;  // two of them are a NaN
+    for (unsigned long at = 0; at < bytes; at += sizeof unset) __builtin_memcpy((char*)room + at, &unset, sizeof unset);
+}
 
 static void lane_main() {
     Lanes lanes = {fibres.current % LANES, false};
 #if SHARED
-    static Environment environments[32 / LANES];
-    Environment& env = environments[fibres.current / LANES];
+    Environment& env = copies[fibres.current / LANES];
 #else
     Environment env;
+    fill_unset(&env, sizeof env);
 #endif
     roll(*shared_problem, first_environment + fibres.current / LANES, lanes, env);
     fibres.done[fibres.current] = true;
@@ -131,17 +143,21 @@ static void lane_main() {
     setcontext(&fibres.home);
 }
 
-extern "C" void run(PARAMETERS) {
-    Problem problem = PROBLEM;
+static void simulate(Problem& problem) {
+    const int environments = problem.environments;
 #if LANES == 1
     for (int index = 0; index < environments; index++) {
         Lanes lanes = {0, false};
         Environment env;
+        fill_unset(&env, sizeof env);
         roll(problem, index, lanes, env);
     }
 #else
     for (int first = 0; first < environments; first += 32 / LANES) {
         static char stacks[32][1 << 20];
+#if SHARED
+        fill_unset(copies, sizeof copies);
+#endif
         shared_problem = &problem;
         first_environment = first;
         fibres.count = environments - first < 32 / LANES ? (environments - first) * LANES : 32;
@@ -162,6 +178,21 @@ extern "C" void run(PARAMETERS) {
         }
     }
 #endif
+}
+
+static sigjmp_buf before_faults;
+static void fault(int) { siglongjmp(before_faults, 1); }
+
+// Returns whether a place outside of the arrays was read or written.
+extern "C" int run(PARAMETERS) {
+    Problem problem = PROBLEM;
+    struct sigaction ours = {}, others;
+    ours.sa_handler = fault;
+    sigaction(SIGSEGV, &ours, &others);
+    bool faulty = sigsetjmp(before_faults, 1);
+    if (!faulty) simulate(problem);
+    sigaction(SIGSEGV, &others, nullptr);
+    return faulty;
 }
 """
 
@@ -211,4 +242,5 @@ def library(structure: Structure, flags: tuple[str, ...] = ("-O0",)) -> ctypes.C
 def run(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
     """Do what `fused.launch.launch` does, on the CPU."""
     pointers = [ctypes.c_void_p(None if tensor is None else tensor.data_ptr()) for tensor in tensors]
-    library(structure).run(*pointers, *(ctypes.c_int(number) for number in numbers))
+    faulty = library(structure).run(*pointers, *(ctypes.c_int(number) for number in numbers))
+    assert not faulty, "the kernel used an index that was not set or lies outside of an array"
