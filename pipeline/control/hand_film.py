@@ -49,7 +49,7 @@ def hand_film_of(hand: HandWorld, tables: RunTables, device: str) -> tuple[bytes
 def _picture(hand: HandWorld, tables: RunTables, device: str) -> Callable[[int], tuple[Image, Image]]:
     """Return a function that draws plant and prediction, each (H, W, 3), at the number of a command."""
     middle = np.median(tables.arrays["obs/object"][:, :3], axis=0)
-    renderer = FrameRenderer(_dotted(hand), _camera(middle), device)
+    renderer = FrameRenderer(dotted_model(hand), _camera(middle), device)
     time, ahead = tables.arrays["control/time"], min(AHEAD_S, hand.task.planner.horizon_s)
 
     def drawn(pose: Array, joints: Array) -> Image:
@@ -66,8 +66,8 @@ def _picture(hand: HandWorld, tables: RunTables, device: str) -> Callable[[int],
     return pair
 
 
-def _dotted(hand: HandWorld) -> Model:
-    """Return the model with the hand's links as further bodies, each with dots on its hull."""
+def dotted_model(hand: HandWorld) -> Model:
+    """Return the model with all bodies of the world of a task, in its order; links have dots on their hulls."""
     world, name = hand.world, hand.world.body_names[hand.object]
     body = next(body for body in hand.model.file.bodies if body.name == name)
     start = hand.state(hand.task.start.position_m, hand.task.start.quat_wxyz,

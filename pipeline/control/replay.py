@@ -10,9 +10,10 @@ from ...datasets.io.outputs import reads
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.control_file import RunTables, read_runs
 from ...datasets.rollouts.replay import Replay
-from ...schemas import HAND_FORMAT, ControlResult, ControlTask, InputDataError, parse, read_json
+from ...schemas import HAND_FORMAT, ControlResult, ControlTask, HandTask, InputDataError, parse, read_json
 from ...schemas.documents import parse_json
 from .film import AHEAD_S, predicted_at, visible_model
+from .hand_replay import hand_replays
 from .horizon import Array
 from .task_world import TaskWorld, task_world
 
@@ -21,35 +22,40 @@ DOCUMENT = "control.json"
 
 @reads("model", "run")
 def replays_of(model: Path, run: Path) -> tuple[Model, dict[str, Replay]]:
-    """Return the model of runs with the finger in it, and the motions of each run, by name.
+    """Return the model of runs with the finger or the hand in it, and the motions of each run, by name.
 
     Args:
         model: The model that the runs are of.
         run: What `cgwm control` has written.
 
     Raises:
-        InputDataError: If one of them cannot be read, the model has no such object, or the runs are those of a hand.
+        InputDataError: If one of them cannot be read, the model has no such object, or the file of a hand is not the
+            one that the runs were made with.
     """
     document = Path(run) / DOCUMENT
     file = read_json(document, ControlResult)
     asked = parse_json(file.settings.get("task", ""), document)
+    runs = [one for one in read_runs(Path(run) / file.recording) if len(one.arrays["control/time"])]
+    where = f"{document}, settings.task"
     if str(asked.get("format", "")) == HAND_FORMAT:
-        raise InputDataError(
-            f"{run}: these are runs of a hand, which the viewer cannot show.", "runs of a finger.", "see its page."
-        )
-    task = parse(asked, ControlTask, f"{document}, settings.task")
-    found = task_world(read_model(model), task)
-    motions = {}
-    for one in read_runs(Path(run) / file.recording):
-        if len(one.arrays["control/time"]):
-            motions[f"seed {one.seed}"] = _plant(found, one)
-            motions[f"seed {one.seed}, predicted {AHEAD_S:g} s before"] = _predicted(found, one)
+        shown, motions = hand_replays(read_model(model), parse(asked, HandTask, where), file, runs)
+    else:
+        shown, motions = _push_replays(task_world(read_model(model), parse(asked, ControlTask, where)), runs)
     if not motions:
         raise InputDataError(
             f"{run}: no run has a command.",
             "runs with commands.",
             todo="run 'cgwm control' again until at least one plan is executed.",
         )
+    return shown, motions
+
+
+def _push_replays(found: TaskWorld, runs: list[RunTables]) -> tuple[Model, dict[str, Replay]]:
+    """Return the model with the finger in it, and the motions of pushes."""
+    motions = {}
+    for one in runs:
+        motions[f"seed {one.seed}"] = _plant(found, one)
+        motions[f"seed {one.seed}, predicted {AHEAD_S:g} s before"] = _predicted(found, one)
     seen = found.world.body_names[found.object] in found.model.body_splats
     return visible_model(found) if seen else found.model, motions
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,9 @@ from cgwm.datasets.rollouts.control_file import read_runs
 from cgwm.pipeline.control import control, replays_of
 from cgwm.pipeline.view.motions import replayed
 from cgwm.pipeline.view.stage import open_view
-from cgwm.schemas import HAND_TASKS, InputDataError, task_toml
+from cgwm.schemas import InputDataError, task_toml
 from helpers import fused_host
+from helpers.paddles import hand_task, write_hand
 from helpers.pushing import RADIUS, push_task, pushed_model
 
 pytestmark = [
@@ -50,12 +50,31 @@ def test_a_replay_is_what_was_recorded_and_what_was_predicted(folder: Path) -> N
     assert [len(rows["mode"]) for rows in shown.contacts] == pressed.astype(int).tolist()
 
 
-def test_a_run_alone_and_that_of_a_hand_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_a_run_alone_is_refused(folder: Path) -> None:
     with pytest.raises(InputDataError, match="cgwm view MODEL --run"):
         open_view(folder / "run")
-    (tmp_path / "run").mkdir()
-    document = json.loads((folder / "run" / "control.json").read_text())
-    document["settings"]["task"] = HAND_TASKS["hand"].model_dump_json()
-    (tmp_path / "run" / "control.json").write_text(json.dumps(document))
-    with pytest.raises(InputDataError, match="runs of a hand"):
+
+
+def test_a_run_of_a_hand_shows_its_links_and_wants_the_same_hand(folder: Path, tmp_path: Path) -> None:
+    hand = write_hand(tmp_path)
+    task = hand_task(tmp_path, success={"timeout_s": 0.6})
+    (tmp_path / "turn.toml").write_text(task_toml(task))
+    control(folder / "model", tmp_path / "turn.toml", tmp_path / "run", clock="ideal")
+    model, motions = replays_of(folder / "model", tmp_path / "run")
+    assert list(motions) == ["seed 0", "seed 0, predicted 0.4 s before"]
+    names = [body.name for body in model.file.bodies]
+    assert names == ["palm", "arm", "tip", "cube"] and set(model.body_splats) == set(names)
+    arrays = read_runs(tmp_path / "run" / "run.h5")[0].arrays
+    real, ahead = motions.values()
+    np.testing.assert_array_equal(real.position_m[:, 3], arrays["obs/object"][:, :3])
+    swing = arrays["obs/joints"][:, 0]
+    turned = np.stack((np.cos(swing / 2), 0 * swing, 0 * swing, np.sin(swing / 2)), -1)
+    np.testing.assert_allclose(real.quat_wxyz[:, 1], turned, atol=1e-12)
+    np.testing.assert_array_equal(ahead.position_m[:, :3], real.position_m[:, :3])  # plans show the object alone
+    assert (ahead.quat_wxyz[:8, 3] == real.quat_wxyz[:8, 3]).all() and (ahead.position_m != real.position_m).any()
+    hand.write_text(hand.read_text() + "<!-- another -->")
+    with pytest.raises(InputDataError, match="the hand is not that of these runs"):
+        replays_of(folder / "model", tmp_path / "run")
+    hand.unlink()
+    with pytest.raises(InputDataError, match="is not there"):
         replays_of(folder / "model", tmp_path / "run")

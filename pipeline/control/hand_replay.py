@@ -1,0 +1,83 @@
+"""Runs of a hand as motions of its links and the object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...datasets.io.atomic import sha256
+from ...datasets.models.model import Model
+from ...datasets.rollouts.control_file import RunTables
+from ...datasets.rollouts.replay import Replay
+from ...schemas import ControlResult, HandTask, InputDataError
+from .film import AHEAD_S, predicted_at
+from .hand_film import dotted_model
+from .hand_world import HandWorld, hand_world
+from .horizon import Array
+
+
+def hand_replays(
+    model: Model, task: HandTask, file: ControlResult, runs: Sequence[RunTables]
+) -> tuple[Model, dict[str, Replay]]:
+    """Return the model with the hand in it, and the motions of runs, by name.
+
+    Args:
+        model: The model that the runs are of.
+        task: Their task.
+        file: Their document, which has the path of the task and the hash of the hand's file.
+        runs: The runs.
+
+    Raises:
+        InputDataError: If the file of the hand is not where it was, or is not the same.
+    """
+    task._source = file.task
+    _require_same(task, file)
+    hand = hand_world(model, task)
+    ahead = min(AHEAD_S, task.planner.horizon_s)
+    motions = {}
+    for run in runs:
+        actual = run.arrays["obs/object"]
+        motions[f"seed {run.seed}"] = _replay(hand, run, actual)
+        motions[f"seed {run.seed}, predicted {ahead:g} s before"] = _replay(hand, run, _predicted(run, actual, ahead))
+    return dotted_model(hand), motions
+
+
+def _require_same(task: HandTask, file: ControlResult) -> None:
+    """Check that the file of the hand is that of the runs: links of another would be shown in wrong places."""
+    path = task.folder / task.robot.file
+    if not path.is_file():
+        raise InputDataError(
+            f"{path}: the hand of these runs is not there.",
+            "the hand's file where it was, beside the task.",
+            "call this from the directory in which 'cgwm control' ran, or put the file back.",
+        )
+    known = file.input_sha256.get(task.robot.file)
+    if known is not None and sha256(path) != known:
+        raise InputDataError(
+            f"{path}: the hand is not that of these runs.",
+            "the same file.",
+            "put it back, or run 'cgwm control' again.",
+        )
+
+
+def _predicted(run: RunTables, actual: Array, ahead_s: float) -> Array:
+    """Return the poses (T, 7) of the object that plans of a while before had predicted; the actual ones before."""
+    found = [predicted_at(run, float(now), ahead_s) for now in run.arrays["control/time"]]
+    return np.array([real if pair is None else pair[0] for pair, real in zip(found, actual, strict=True)])
+
+
+def _replay(hand: HandWorld, run: RunTables, pose: Array) -> Replay:
+    """Return the motion of the links of a run, with the object at poses (T, 7)."""
+    states = [
+        hand.state(row[:3], row[3:], dict(zip(hand.joints, joints.tolist(), strict=True)))
+        for row, joints in zip(pose, run.arrays["obs/joints"], strict=True)
+    ]
+    none = np.zeros((len(states), 3))
+    return Replay(
+        times_s=run.arrays["control/time"],
+        position_m=np.stack([state.position_m[0].numpy() for state in states]),
+        quat_wxyz=np.stack([state.quat_wxyz[0].numpy() for state in states]),
+        contact_m=none,
+        impulse_n_s=none,
+    )
