@@ -14,6 +14,7 @@ from ...schemas import BodyModel, Light
 from ..geometry.rotation import quat_to_matrix
 from ..geometry.spheres import Spheres
 from ..geometry.spherical_harmonics import harmonics
+from .edge_light import EdgeLight, Edges
 from .relighting import Relighting
 
 
@@ -57,14 +58,20 @@ class Labelled:
     """Label of each sphere: 0 for the background, k for the k-th body, shape (N,)."""
     gloss: Gloss | None = None
     """How the colours of a body depend on the direction of view; None where they do not, or are as a camera sees."""
+    edges: EdgeLight | None = None
+    """Light on the spheres at the edges of a body; None without a light, or where the colours are as a camera sees."""
 
     def seen_from(self, eyes: Tensor) -> Labelled:
         """Return the spheres in the colours that cameras at `eyes` (m, 3) [m] see, one set of views after the other."""
-        if self.gloss is None:
+        if self.gloss is None and self.edges is None:
             return self if len(eyes) == 1 else self.repeated(len(eyes))
-        colors = [self.gloss.added(self.colors, self.means, eye) for eye in eyes]
-        whole = replace(self, gloss=None).repeated(len(eyes)) if self.means.dim() == 3 else replace(self, gloss=None)
-        return replace(whole, colors=torch.cat(colors))
+        plain = replace(self, gloss=None, edges=None)
+        whole = plain.repeated(len(eyes)) if self.means.dim() == 3 else plain
+        return replace(whole, colors=torch.cat([self._colors_from(eye) for eye in eyes]))
+
+    def _colors_from(self, eye: Tensor) -> Tensor:
+        colors = self.colors if self.edges is None else self.edges.seen(self.colors, self.means, eye)
+        return colors if self.gloss is None else self.gloss.added(colors, self.means, eye)
 
     def __len__(self) -> int:
         return self.scales.shape[0]
@@ -88,6 +95,7 @@ class Labelled:
             colors=self.colors[number],
             labels=self.labels,
             gloss=None if self.gloss is None else self.gloss.view(number),
+            edges=None if self.edges is None else self.edges.view(number),
         )
 
     def repeated(self, times: int) -> Labelled:
@@ -130,6 +138,10 @@ class _Moving:
     """Relighting of the spheres; None to keep the colours of the photos."""
     harmonics: Tensor | None = None
     """Harmonics of the colours from degree 1 on, body frame, shape (N, K, 3); None for colours equal from all sides."""
+    light: Light | None = None
+    """The light; None to keep the colours of the photos."""
+    edges: Edges | None = None
+    """Spheres at the body's edges; None without a light or normals."""
 
     def placed(self, position_m: Tensor, quat_wxyz: Tensor) -> Labelled:
         """Return the spheres at positions (n, 3) [m] and orientations (n, 4)."""
@@ -147,7 +159,15 @@ class _Moving:
             colors=colors,
             labels=self.spheres.labels,
             gloss=None if self.harmonics is None else Gloss(self.harmonics, rotations, brightness),
+            edges=None if self.edges is None or self.light is None else self.edges.placed(self.light, rotations),
         )
+
+    def lit(self, light: Light | None, body: BodyModel) -> _Moving:
+        """Return the spheres under a light, or in the colours of the photos."""
+        if light is None or self.normals is None:
+            return replace(self, relighting=None, light=None)
+        edges = self.edges or Edges.of(self.spheres.means, self.spheres.scales, self.normals)
+        return replace(self, relighting=Relighting.of(light, body, self.normals), light=light, edges=edges)
 
 
 class LabelledModel:
@@ -185,15 +205,7 @@ class LabelledModel:
 
     def set_light(self, light: Light | None) -> None:
         """Set the light that shades moving bodies; None keeps the colours of the photos in every pose."""
-        self.moving = [
-            replace(
-                part,
-                relighting=None
-                if light is None or part.normals is None
-                else Relighting.of(light, self._bodies[part.body], part.normals),
-            )
-            for part in self.moving
-        ]
+        self.moving = [part.lit(light, self._bodies[part.body]) for part in self.moving]
 
     def tensor(self, values: object) -> Tensor:
         """Return values as a float32 tensor on the device."""

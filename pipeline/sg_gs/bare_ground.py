@@ -31,6 +31,8 @@ _LARGEST = 0.15
 _INPAINT_CELLS = 5
 _SPACING_CELLS, _SCALE_CELLS = 2, 1.3
 """Distance and scale of the spheres that fill hidden ground, in cells."""
+_SUNK = 2.0
+"""Depth of their centres below the ground, in scales: on it they would cover the foot of a body that moves there."""
 _GAP_CELLS = 2
 
 
@@ -153,6 +155,7 @@ def _filled(scene: Spheres, photo: GroundPhoto, hidden: NDArray[np.bool_], bare:
     if not len(rows):
         return kept
     points = photo.points(np.stack([columns + 0.5, rows + 0.5], 1))
+    points = points - _SUNK * _SCALE_CELLS * photo.cell * photo.axes[2]
     fill = to_spheres(points, np.full(len(rows), _SCALE_CELLS * photo.cell), 0.95, scene.means.device)
     colors = torch.as_tensor(bare[rows, columns]).to(scene.colors)
     return Spheres.joined([kept, replace(fill, colors=colors)])

@@ -127,7 +127,9 @@ def scene_seeds(
     points = None if points is None else points[~_on_bodies(points, views)]
     standing = _off_ground_points(views, ground, points, rest, rng)
     if standing is not None and len(standing) > 3:
-        parts.append(_with_neighbour_scales(standing, rest if ground is None else rest // 4, rng))
+        kept = standing[rng.permutation(len(standing))[: rest if ground is None else rest // 4]]
+        lying = [] if ground is None or points is None else [points[_lying(points, ground, spread)]]
+        parts.append((kept, _neighbour_scales(kept, np.concatenate([kept, *lying]))))
     if ground is not None:
         hits, met = _on_ground(sample, ground, _FAR_FACTOR * spread)
         used = sum(len(part[0]) for part in parts)
@@ -153,8 +155,12 @@ def _off_ground_points(
         return _random_points(views, count, rng) if ground is None and not shows_bodies(views) else None
     if ground is None:
         return points
-    spread = _spread(np.stack([view.camera.center for view in views]))
-    return points[points @ np.array(ground.normal) - ground.offset_m > 0.02 * spread]
+    return points[~_lying(points, ground, _spread(np.stack([view.camera.center for view in views])))]
+
+
+def _lying(points: Array, ground: Ground, spread: float) -> NDArray[np.bool_]:
+    """Return which points (n, 3) are no higher above the ground than a share of the cameras' spread [m]."""
+    return points @ np.array(ground.normal) - ground.offset_m <= 0.02 * spread
 
 
 def shows_bodies(views: Sequence[View]) -> bool:
@@ -296,12 +302,15 @@ def _numbered(keys: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], ND
     return np.flatnonzero(there), (np.cumsum(there) - 1)[keys]
 
 
-def _with_neighbour_scales(points: Array, budget: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return at most `budget` of the points, with scales of half the distance to the third neighbour."""
-    kept = points[rng.permutation(len(points))[:budget]]
-    away, _ = KDTree(kept).query(kept, k=min(4, len(kept)))
-    scale = 0.5 * away[:, -1]
-    return kept, np.clip(scale, 1e-3 * np.median(scale) + 1e-9, 5 * np.median(scale) + 1e-9)
+def _neighbour_scales(points: Array, among: Array) -> Array:
+    """Return scales (n,) of half the distance of points (n, 3) to the third neighbour among points (m, 3), with them.
+
+    A few stray points are far from each other, but not from what else there is: as large as their distances they would
+    be a haze before what cameras elsewhere see.
+    """
+    scale = 0.5 * KDTree(among).query(points, k=min(4, len(among)))[0][:, -1]
+    usual = float(np.median(scale))
+    return np.clip(scale, 1e-3 * usual + 1e-9, 5 * usual + 1e-9)
 
 
 def _shell(sample: _Pixels, cameras: Array, points: Array | None, budget: int) -> tuple[Array, Array]:

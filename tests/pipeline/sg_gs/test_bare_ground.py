@@ -79,8 +79,13 @@ def test_the_shadow_is_lifted_from_the_ground_alone_and_hidden_ground_is_covered
     bare = ground_module._inpainted(photo.colors, photo.seen, hidden)
     filled = ground_module._filled(scene, photo, hidden, bare)
     places = np.floor(photo.places(filled.means.double().numpy())).astype(int)
-    ground = np.abs(filled.means[:, 2].numpy()) < 1e-6
+    ground = filled.means[:, 2].numpy() < 1e-6
     covered = np.zeros((CELLS, CELLS), bool)
     covered[places[ground, 1], places[ground, 0]] = True
     assert cv2.dilate(covered.astype(np.uint8), np.ones((3, 3)))[hidden].mean() > 0.95
     assert filled.colors[len(filled) - 50 :].min() > 0.2
+    # they end below the ground: on it they would stand before the foot of a body
+    new = filled.means[:, 2].numpy() < -1e-6
+    depth = -filled.means[new, 2] / filled.scales[new]
+    assert new.sum() > 50
+    assert float((filled.opacities[new] * torch.exp(-0.5 * depth**2)).max()) < 0.15

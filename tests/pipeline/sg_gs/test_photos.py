@@ -12,7 +12,7 @@ from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.sg_gs.camera_refinement import Motions, motion_record, moved_for_good
 from cgwm.pipeline.sg_gs.colors import mean_colors
 from cgwm.pipeline.sg_gs.held_out import look
-from cgwm.pipeline.sg_gs.initialization import points_of_depth
+from cgwm.pipeline.sg_gs.initialization import _neighbour_scales, points_of_depth
 from cgwm.pipeline.sg_gs.losses import geometry_loss, normals_of, scene_loss
 from cgwm.pipeline.sg_gs.optimize import Rates, Trainable, descend
 from cgwm.pipeline.sg_gs.photo_exposure import Exposures
@@ -284,3 +284,15 @@ def test_depth_pulls_the_colliding_surface_to_where_it_was_measured(views):
     local = spheres.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     front = (local[:, 2] - 2 * spheres.scales).detach()
     assert float((front - 0.3).abs().median()) < 2e-3  # it began 6 mm behind
+
+
+def test_stray_points_above_the_ground_get_no_large_spheres() -> None:
+    rng = np.random.default_rng(0)
+    lying = np.concatenate([rng.uniform(-0.5, 0.5, (2000, 2)), np.zeros((2000, 1))], 1)
+    stray = np.array([[0.4, 0.1, 0.01], [-0.3, 0.2, 0.02], [0.0, -0.4, 0.03], [0.3, -0.3, 0.1], [-0.4, -0.4, 0.12]])
+    together = _neighbour_scales(stray, np.concatenate([stray, lying]))
+    assert (together < 0.6 * _neighbour_scales(stray, stray)).all()
+    assert together[:3] == pytest.approx(0.5 * np.hypot(stray[:3, 2], 0.02), rel=0.6)  # as of the ground below
+    wall = np.stack([rng.uniform(-0.5, 0.5, 500), np.full(500, 0.5), rng.uniform(0.05, 1, 500)], 1)
+    both = _neighbour_scales(wall, np.concatenate([wall, lying]))
+    assert np.median(both) == pytest.approx(np.median(_neighbour_scales(wall, wall)), rel=0.05)
