@@ -2,8 +2,8 @@
 
 A cube is thrown onto the ground as `cgwm synthesize` would throw it, from many starts, for several frictions, contact
 times and damping ratios. Each export is simulated as it is, and with MuJoCo's own contacts (no `pair`), whose friction
-has the time constant of solref. With `--search`, the time constant of friction, the impedance, impratio, the friction
-and the cone are varied, and each line shows one setting. Run with
+has the time constant of solref. With `--search`, the time constant of friction, the impedance, impratio, the friction,
+the cone and friction found after the normal forces (`apart`) are varied, and each line shows one setting. Run with
 
     python benchmarks/mjcf_contacts.py [--starts 100] [--seed 1000] [--search] [--model MODEL]
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from cgwm.datasets.models.mjcf import write_mjcf
+from cgwm.datasets.models.mjcf import APART, APART_ITERATIONS, write_mjcf
 from cgwm.datasets.models.model import Model, read_model
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.pipeline.export.mujoco_check import AFTER_CONTACT_S, FRAME_S, start_of
@@ -119,16 +120,18 @@ def deviation(case: Case, setting: Mapping[str, float]) -> tuple[float, float, f
     Args:
         case: The case.
         setting: `soft` (the time constant of solref for friction, too), `share` (of the contact time), `impedance`,
-            `impratio`, `friction` (a factor), `pyramid`.
+            `impratio`, `friction` (a factor), `pyramid`, `apart` (normal forces before friction, as in files of
+            slippery bodies); empty for the numbers of the file.
     """
-    loaded, law = case.loaded, case.law
-    impedance = setting.get("impedance", 0.99)
-    loaded.pair_solimp[:, :2] = impedance
-    loaded.pair_friction[:, :2] = law.friction * setting.get("friction", 1.0)
-    share = setting.get("share", 1.0)
-    loaded.pair_solreffriction[:] = (0.0, 0.0) if setting.get("soft") else (law.contact_time_s * share, 1.0)
-    loaded.opt.impratio = setting.get("impratio", 1.0)
-    loaded.opt.cone = 0 if setting.get("pyramid") else 1
+    loaded, law = copy(case.loaded), case.law
+    if setting:
+        loaded.pair_solimp[:, :2] = setting.get("impedance", 0.99)
+        loaded.pair_friction[:, :2] = law.friction * setting.get("friction", 1.0)
+        share = setting.get("share", 1.0)
+        loaded.pair_solreffriction[:] = (0.0, 0.0) if setting.get("soft") else (law.contact_time_s * share, 1.0)
+        loaded.opt.impratio = APART if setting.get("apart") else setting.get("impratio", 1.0)
+        loaded.opt.noslip_iterations = APART_ITERATIONS if setting.get("apart") else 0
+        loaded.opt.cone = 0 if setting.get("pyramid") else 1
     data = mujoco.MjData(loaded)  # pyright: ignore[reportAttributeAccessIssue]
     found = np.array([_simulated(loaded, data, *one) for one in zip(case.starts, case.frames, strict=True)])
     away_mm = 1e3 * np.linalg.norm(found[:, :3] - case.position_m, axis=1)
@@ -150,7 +153,8 @@ def settings(search: bool) -> list[dict[str, float]]:
     if not search:
         return [{"soft": 1.0}, {}]
     others: list[dict[str, float]] = [{"friction": 1.2}, {"friction": 0.85}, {"impedance": 0.9, "impratio": 10.0}]
-    return [{"soft": 1.0}, *({"share": share} for share in SHARES), *others, {"pyramid": 1.0}]
+    apart = [{"apart": 1.0, "share": share} for share in (0.25, 0.5, 1.0)]
+    return [{"soft": 1.0}, *({"share": share} for share in SHARES), *others, {"pyramid": 1.0}, *apart]
 
 
 def main() -> int:

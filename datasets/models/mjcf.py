@@ -12,6 +12,11 @@ the deviation from Coulomb's law was within a fifth of the least that any time c
 reached, except at friction 0.8 (a quarter to a half); other values of solimp, impratio, friction and MuJoCo's pyramidal
 cone were no better (`benchmarks/mjcf_contacts.py`). Only a `pair` can have it, so each two geoms that may touch are
 one.
+
+Slippery bodies slide through whole impacts, lifted all the while. In their files the normal forces come first, and then
+the friction that they allow: an `impratio` of nearly nothing leaves the cone out of the solution for all forces, and
+`noslip_iterations` find the friction within the cones of the normal forces found. Where bodies stick it is the worse
+way: friction at an edge then changes the normal force, which no longer follows.
 """
 
 from __future__ import annotations
@@ -38,6 +43,12 @@ HALF_SHEET_M = 1e-3
 IMPEDANCE = 0.99
 """d of solimp; the penetration at rest in MuJoCo is (1 - d) g tau^2 / number of contacts."""
 
+SLIPPERY = 0.3
+"""Largest friction with which normal forces are found before friction."""
+APART, APART_ITERATIONS = 1e-6, 10
+"""`impratio` and `noslip_iterations` there."""
+SLIPPERY_SHARE = 0.5
+"""Time in which slip decays there, of the contact time."""
 
 MOVED = ("free", "link")
 """Motions of bodies that physics moves."""
@@ -90,12 +101,14 @@ def write_mjcf(
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     # RK4: the other integrators damp the tumbling of a free body.
     option = {"timestep": _text(_timestep(file)), "gravity": _text(file.gravity_m_s2), "integrator": "RK4"}
+    if _slippery(model):
+        option |= {"impratio": _text(APART), "noslip_iterations": str(APART_ITERATIONS)}
     ET.SubElement(root, "option", option, cone="elliptic")
     defaults = ET.SubElement(root, "default")
     geom = ET.SubElement(defaults, "geom", contype="1", conaffinity="1", condim="3")
     geom.attrib.update(_contact(file.contact))
     if file.contact is not None:
-        ET.SubElement(defaults, "pair", _pair(file.contact))
+        ET.SubElement(defaults, "pair", _pair(file.contact, _slippery(model)))
     world = ET.SubElement(root, "worldbody")
     if file.ground is not None:
         normal = np.asarray(file.ground.normal)
@@ -194,10 +207,18 @@ def _contact(contact: ContactParameters | None) -> dict[str, str]:
     }
 
 
-def _pair(law: ContactParameters) -> dict[str, str]:
-    """Return the attributes of a `pair` with a contact law."""
+def _pair(law: ContactParameters, slippery: bool) -> dict[str, str]:
+    """Return the attributes of a `pair` with a contact law, in a file of slippery bodies or another."""
     friction = {"friction": _text((law.friction, law.friction, 0.0, 0.0, 0.0)), "condim": "3"}
-    return _contact(law) | friction | {"solreffriction": _text((law.contact_time_s, 1.0))}
+    decay_s = law.contact_time_s * (SLIPPERY_SHARE if slippery else 1.0)
+    return _contact(law) | friction | {"solreffriction": _text((decay_s, 1.0))}
+
+
+def _slippery(model: Model) -> bool:
+    """Return whether all that touches is slippery, and has a `pair`: how forces are found is one option of a file."""
+    file = model.file
+    laws = [law for law in (file.contact, *file.pairs) if law is not None]
+    return bool(laws) and max(law.friction for law in laws) <= SLIPPERY and not softer_pairs(model)
 
 
 def _add_surface(root: ET.Element, world: ET.Element, surface: Surface, model: Model) -> None:
@@ -266,7 +287,7 @@ def _add_pairs(contact: ET.Element, model: Model) -> None:
                 f"up to {MOST_PAIRS} pairs.",
                 "fit with fewer collision spheres (--spheres), or give the surface fewer triangles.",
             )
-        numbers = {} if own is None else _pair(own)
+        numbers = {} if own is None else _pair(own, _slippery(model))
         for first, second in product(mine, names):
             ET.SubElement(contact, "pair", geom1=first, geom2=second).attrib.update(numbers)
 
