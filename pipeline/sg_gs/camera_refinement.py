@@ -92,7 +92,7 @@ def find_motion(spheres: Spheres, view: View, weight: Tensor, spread: float) -> 
         picture = render_view(spheres, moved(view, _motion(twist, spread))).features[0]
         picture = picture * least_squares_gain(picture.detach(), view.image, weight)
         optimiser.zero_grad()
-        (photometric(picture, view.image, weight) + _prior(twist)).backward()
+        (photometric(picture, view.completed(picture.detach()), weight) + _prior(twist)).backward()
         optimiser.step()
         optimiser.decay((LAST_RATE / _SINGLE_RATE) ** (1 / _SINGLE_STEPS))
     return _motion(twist.detach(), spread)

@@ -41,6 +41,7 @@ def observed_colors(spheres: Spheres, views: Sequence[View], body: int | None = 
         colored = Spheres(spheres.means, spheres.scales, spheres.opacities, features)
         image = render_view(colored, view).features[0]
         photo = torch.cat([view.image, torch.ones_like(view.image[..., :1])], -1)
+        photo = photo if view.seen is None else photo * view.seen[..., None]
         if body is not None:
             photo = photo * (cover_of(view)[body] > SURELY_COVERED)[..., None]
         total += torch.autograd.grad((image * photo).sum(), features)[0]

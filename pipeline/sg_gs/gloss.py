@@ -90,7 +90,7 @@ class _Observed:
             seen = spheres.seen_from(eye)
             features = torch.cat([seen.colors, torch.ones_like(seen.colors[:, :1])], 1).detach().requires_grad_()
             picture = render_view(Spheres(seen.means, seen.scales, seen.opacities, features), view).features[0]
-            inside = (cover_of(view)[body] > SURELY_COVERED)[..., None].to(picture)
+            inside = view.weighted((cover_of(view)[body] > SURELY_COVERED).to(picture))[..., None]
             left = (view.image - picture[..., :3]).detach() * inside
             (found,) = torch.autograd.grad((picture * torch.cat([left, inside], -1)).sum(), features)
             residuals.append(found[:, :3] / found[:, 3:].clamp_min(1e-6))
@@ -129,6 +129,7 @@ def _psnr_db(spheres: Spheres, views: Sequence[View], body: int) -> float:
     total, count = 0.0, 0
     for view in views:
         inside = cover_of(view)[body] > SURELY_COVERED
+        inside = inside if view.seen is None else inside & view.seen
         away = (render_view(spheres, view).features[0][..., :3].clamp(0, 1) - view.image)[inside]
         total, count = total + float(away.square().sum()), count + away.numel()
     return -10 * float(np.log10(max(total, 1e-12) / max(count, 1)))

@@ -95,10 +95,10 @@ def photograph_ground(ground: Ground, bodies: Array, views: Sequence[View]) -> G
 def _on_ground(view: View, normal: Array, offset_m: float) -> tuple[Array, Array]:
     """Return the points on the ground (n, 3) [m] that a photo's pixels show beside all masks, and their colours."""
     image = view.image.detach().cpu().numpy()
-    free = np.ones(image.shape[:2], np.uint8)
+    free = np.ones(image.shape[:2], np.uint8) if view.seen is None else view.seen.cpu().numpy().astype(np.uint8)
     if view.cover is not None:
         body = (view.cover.sum(0).cpu().numpy() > 0.01).astype(np.uint8)
-        free = 1 - cv2.dilate(body, np.ones((2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1), np.uint8))
+        free &= 1 - cv2.dilate(body, np.ones((2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1), np.uint8))
     rows, columns = np.nonzero(free)
     rays, eye = view.rays(columns, rows), view.camera.center
     down = rays @ normal

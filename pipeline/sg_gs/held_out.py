@@ -55,16 +55,16 @@ def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, sp
         plain = features[..., :3]
         picture = plain.clamp(0, 1)
         pictures.append(as_bytes(picture))
-        whole.append(psnr(picture, view.image))
-        similar.append(float(ssim_map(picture, view.image).mean()))
+        whole.append(psnr(picture, view.image, view.seen))
+        similar.append(_ssim(picture, view))
         if view.cover is not None and bodies:
             true, mine = view.cover.sum(0) > COVERED, features[..., 3] > COVERED
             if true.any():
-                inside.append(psnr(picture, view.image, true))
+                inside.append(psnr(picture, view.image, true if view.seen is None else true & view.seen))
                 overlap.append(float((true & mine).sum() / (true | mine).sum()))
-        right = slice(view.image.shape[1] // 2, None)
         shown = _corrected(everything, view, plain, spread, poses)
-        halves.append((psnr(picture[:, right], view.image[:, right]), psnr(shown[:, right], view.image[:, right])))
+        right = _half(view, left=False) > 0
+        halves.append((psnr(picture, view.image, right), psnr(shown, view.image, right)))
     sheet = None
     if pictures:
         sheet = small_png(compared([as_bytes(view.image) for view in views], pictures), SHEET_BYTES)
@@ -86,13 +86,27 @@ def _corrected(spheres: Spheres, view: View, picture: Tensor, spread: float, pos
 
     `picture` (H, W, 3) is the render from the given pose.
     """
-    left = torch.zeros_like(view.image[..., 0])
-    left[:, : left.shape[1] // 2] = 1.0
+    left = _half(view, left=True)
     if poses:
         with torch.enable_grad():
             view = moved(view, find_motion(spheres, view, left, spread))
         picture = render_view(spheres, view).features[0]
     return (picture * least_squares_gain(picture, view.image, left)).clamp(0, 1)
+
+
+def _half(view: View, *, left: bool) -> Tensor:
+    """Return the weights (H, W) of the left or the right half of a photo: 1 where it shows something."""
+    half = torch.zeros_like(view.image[..., 0])
+    middle = half.shape[1] // 2
+    half[:, :middle] = float(left)
+    half[:, middle:] = float(not left)
+    return view.weighted(half)
+
+
+def _ssim(picture: Tensor, view: View) -> float:
+    """Return the mean structural similarity of a render (H, W, 3) to what a photo shows."""
+    similar = ssim_map(picture, view.completed(picture))
+    return float((similar if view.seen is None else similar[view.seen]).mean())
 
 
 def _mean(values: list[float]) -> float | None:

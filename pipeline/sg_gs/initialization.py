@@ -233,6 +233,9 @@ def _background_pixels(views: Sequence[View], rng: np.random.Generator) -> _Pixe
         if view.cover is not None:
             free = view.cover.sum(0).cpu().numpy()[v, u] < 0.05
             u, v = u[free], v[free]
+        if view.seen is not None:
+            shown = view.seen.cpu().numpy()[v, u]
+            u, v = u[shown], v[shown]
         rays.append(view.rays(u, v))
         origins.append(np.tile(view.camera.center, (len(u), 1)))
         colors.append(view.image.cpu().numpy()[v, u])

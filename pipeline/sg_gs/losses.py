@@ -42,7 +42,7 @@ def geometry_loss(body: int, size_m: float, radius_factor: float) -> Loss:
 
     def loss(spheres: Spheres, view: View, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         cover = cover_of(view)
-        mine, free = cover[body], 1 - (cover.sum(0) - cover[body])
+        mine, free = cover[body], view.weighted(1 - (cover.sum(0) - cover[body]))
         front = _front(spheres, view, radius_factor)
         output = render_view(replace(spheres, colors=torch.cat([spheres.colors, front[:, None]], 1)), view)
         off = (output.alpha[0] - mine) * free
@@ -104,7 +104,7 @@ def body_loss(body: int, exposures: Exposures) -> Loss:
         mine = cover[body][..., None]
         exposures.follow(view, output.features[0].detach(), cover[body] > SURELY_COVERED)
         picture = exposures.gain(view) * output.features[0] + (1 - output.alpha[0])[..., None] * background
-        others = (cover.sum(0) - cover[body])[..., None]
+        others = 1 - view.weighted(1 - (cover.sum(0) - cover[body]))[..., None]
         # Pixels at the border mix body and background; the colour of the body in them is unknown.
         target = torch.where(mine > 0.95, view.image, mine * picture.detach() + (1 - mine) * background)
         sure = (1 - others[..., 0]) * ((mine[..., 0] > 0.95) | (mine[..., 0] < 0.05))
@@ -133,15 +133,16 @@ def scene_loss(bodies: Spheres | None, exposures: Exposures, motions: Motions | 
     def loss(spheres: Spheres, view: View, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         view = view if motions is None else motions.moved(view)
         output = render_view(behind(bodies, spheres), view)
-        exposures.follow(view, output.features[0].detach(), output.alpha[0].detach() > 0.5)
+        exposures.follow(view, output.features[0].detach(), view.weighted((output.alpha[0].detach() > 0.5).float()))
         picture = exposures.gain(view) * output.features[0]
-        value = photometric(picture, view.image, None if bodies is not None else scene_weight(view))
+        photo = view.completed(picture.detach())
+        value = photometric(picture, photo, None if bodies is not None else scene_weight(view))
         if motions is not None:
             value = value + motions.prior(view)
         if view.depth is not None:
             seen = output.alpha[0].detach() > 0.5
             value = value + DEPTH_WEIGHT * depth_error(output.depth[0], view.depth, seen, view.depth.clamp_min(1e-6))
-        return value, (picture - view.image).detach().square().mean()
+        return value, (picture - photo).detach().square().mean()
 
     return loss
 

@@ -270,4 +270,8 @@ def _reduced(view: View) -> View:
     images = [view.image.permute(2, 0, 1), *([] if view.cover is None else [view.cover])]
     image, *cover = (functional.interpolate(one[None], size=size, mode="area")[0] for one in images)
     K = torch.diag(torch.tensor([size[1] / width, size[0] / height, 1.0])).to(view.K) @ view.K
-    return replace(view, image=image.permute(1, 2, 0).contiguous(), cover=cover[0] if cover else None, K=K)
+    seen = None
+    if view.seen is not None:
+        seen = functional.interpolate(view.seen[None, None].float(), size=size, mode="area")[0, 0] > 0.999
+    cover_now = cover[0] if cover else None
+    return replace(view, image=image.permute(1, 2, 0).contiguous(), cover=cover_now, seen=seen, K=K)

@@ -55,6 +55,9 @@ class View:
     """Feature map, each channel scaled to [0, 1] over all photos, shape (H, W, F); None without one."""
     depth_map: NDArray[np.float32] | None = None
     """Depth at the original size, without distortion [m], shape (h, w), or None."""
+    seen: Tensor | None = None
+    """Whether the photo shows each pixel, shape (H, W); without distortion its edge is curved, and black beyond. None
+    where it shows all."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -82,10 +85,23 @@ class View:
         rows, columns = slice(top, top + height), slice(left, left + width)
         maps = {
             name: None if value is None else value[rows, columns]
-            for name, value in (("depth", self.depth), ("normals", self.normals), ("features", self.features))
+            for name, value in (
+                ("depth", self.depth),
+                ("normals", self.normals),
+                ("features", self.features),
+                ("seen", self.seen),
+            )
         }
         cover = None if self.cover is None else self.cover[:, rows, columns]
         return replace(self, image=self.image[rows, columns], cover=cover, K=K, **maps)
+
+    def completed(self, picture: Tensor) -> Tensor:
+        """Return the photo (H, W, 3), with a picture (H, W, 3) of the view where the photo shows nothing."""
+        return self.image if self.seen is None else torch.where(self.seen[..., None], self.image, picture)
+
+    def weighted(self, weight: Tensor) -> Tensor:
+        """Return weights of pixels (H, W) with 0 where the photo shows nothing."""
+        return weight if self.seen is None else weight * self.seen
 
 
 def load_views(capture: Capture, names: Sequence[str], image_size: int, device: torch.device) -> list[View]:
@@ -117,6 +133,7 @@ def load_views(capture: Capture, names: Sequence[str], image_size: int, device: 
                 normals=None if normals is None else _tensor(normals, device),
                 features=None if features is None else _tensor(features, device),
                 depth_map=maps.depth_m,
+                seen=_seen(original, width, height, device),
             )
         )
     return _with_features_scaled(views)
@@ -246,6 +263,15 @@ def with_labels(view: View, labels: NDArray[np.uint8], bodies: int) -> View:
             own[cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5] = k + 1
         labels = own
     return replace(view, labels=labels, cover=_tensor(_cover(labels, bodies, *view.size), view.image.device))
+
+
+def _seen(original: Camera, width: int, height: int, device: torch.device) -> Tensor | None:
+    """Return which pixels of the undistorted and reduced photo (height, width) its own pixels fill; None for all."""
+    if not np.any(original.distortion):
+        return None
+    shown = original.undistorted(np.full((original.height, original.width), 255, np.uint8))[0]
+    whole = _reduced((shown == 255).astype(np.float32), width, height) > 0.999
+    return None if whole.all() else torch.as_tensor(whole, device=device)
 
 
 def _grey(image: NDArray[np.uint8]) -> Tensor:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from cgwm.datasets.capture.cameras import Camera
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.check import find_faults
 from cgwm.pipeline.geometry.spheres import Spheres
@@ -16,7 +17,7 @@ from cgwm.pipeline.sg_gs.initialization import _neighbour_scales, points_of_dept
 from cgwm.pipeline.sg_gs.losses import geometry_loss, normals_of, scene_loss
 from cgwm.pipeline.sg_gs.optimize import Rates, Trainable, descend
 from cgwm.pipeline.sg_gs.photo_exposure import Exposures
-from cgwm.pipeline.sg_gs.views import load_views, render_view, spread_of
+from cgwm.pipeline.sg_gs.views import View, _seen, load_views, render_view, spread_of
 from cgwm.pipeline.sg_gs.visual_hull import Silhouette, carve
 from pipeline.sg_gs.test_sg_gs import PLACE, make_capture, world
 
@@ -296,3 +297,44 @@ def test_stray_points_above_the_ground_get_no_large_spheres() -> None:
     wall = np.stack([rng.uniform(-0.5, 0.5, 500), np.full(500, 0.5), rng.uniform(0.05, 1, 500)], 1)
     both = _neighbour_scales(wall, np.concatenate([wall, lying]))
     assert np.median(both) == pytest.approx(np.median(_neighbour_scales(wall, wall)), rel=0.05)
+
+
+def _with_black_margin(view: View, pixels: int) -> View:
+    seen = torch.ones(view.size[1], view.size[0], dtype=torch.bool)
+    seen[:, :pixels] = False
+    return replace(view, image=view.image * seen[..., None], seen=seen)
+
+
+def test_what_an_undistorted_photo_does_not_show_counts_nowhere() -> None:
+    camera = Camera(
+        width=80, height=60, K=np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]), T_world_cam=np.eye(4),
+        distortion=np.array([0.3, 0.0, 0.0, 0.0]),
+    )  # fmt: skip
+    seen = _seen(camera, 80, 60, torch.device("cpu"))
+    assert seen is not None and 0.05 < 1 - float(seen.float().mean()) < 0.5
+    white = camera.undistorted(np.full((60, 80, 3), 255, np.uint8))[0]
+    assert (white[seen.numpy()] == 255).all() and (white[~seen.numpy()] < 255).any(-1).all()
+    assert _seen(replace(camera, distortion=np.zeros(0)), 80, 60, torch.device("cpu")) is None
+
+    size = (60, 80)
+    K = torch.tensor([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]])
+    x, y = np.meshgrid(np.linspace(-1.4, 1.4, 29), np.linspace(-1, 1, 21))
+    means = torch.as_tensor(np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], 1)).float()
+    spheres = Spheres(means, torch.full((len(means),), 0.1), torch.full((len(means),), 0.95), torch.rand(len(means), 3))
+    view = View(
+        name="a", image=torch.zeros(*size, 3), cover=None, K=K, viewmat=torch.eye(4), camera=camera, labels=None,
+        grey=torch.zeros(size),
+    )  # fmt: skip
+    view = _with_black_margin(replace(view, image=render_view(spheres, view).features[0]), 12)
+    exact = look([view], [], spheres, 1.0, poses=False).figures
+    assert exact["psnr_db"] > 90 and exact["ssim"] == pytest.approx(1) and exact["psnr_right_half_corrected_db"] > 90
+    free = replace(spheres, colors=spheres.colors.clone().requires_grad_())
+    value, wrong = scene_loss(None, Exposures([view], learned=True))(free, view, torch.Generator())
+    (pull,) = torch.autograd.grad(value, free.colors)
+    assert value.item() == pytest.approx(0, abs=1e-5) and float(wrong) == pytest.approx(0, abs=1e-9)
+    assert float(pull.abs().max()) < 1e-4  # of L1 at rest, rounding decides the signs
+    colors = mean_colors(spheres, [view])
+    blind = mean_colors(spheres, [replace(view, seen=None)])
+    edge = means[:, 0] < -1.1
+    assert float(blind[edge].mean()) < 0.5 * float(colors[edge].mean())
+    assert float(pull[edge].abs().max()) < 1e-6
