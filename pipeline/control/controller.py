@@ -108,7 +108,9 @@ def require_draws(draws: int) -> None:
         raise UsageError(f"{draws} draws.", "0 or more.", todo="give 0 for the mean parameters, or more.")
 
 
-def drawn_worlds(model: Model, draws: int, seed: int, device: str, planned: Callable[[Model | None], World]) -> Worlds:
+def drawn_worlds(
+    model: Model, draws: int, seed: int, device: str, planned: Callable[[Model | None], World], estimate: bool = False
+) -> Worlds:
     """Return the worlds of the predictions: that of the estimate, or of draws from the fit's posterior.
 
     The tensors of a world for a GPU stay on the CPU, from which a batch is copied in one piece.
@@ -119,6 +121,7 @@ def drawn_worlds(model: Model, draws: int, seed: int, device: str, planned: Call
         seed: Seed of the draws.
         device: cpu or cuda.
         planned: Returns the world of predictions of a draw of the model; for None that of the estimate.
+        estimate: Whether the estimate comes before the draws.
     """
     rolls_on = None if device == "cpu" else device
     if draws == 0:
@@ -131,9 +134,11 @@ def drawn_worlds(model: Model, draws: int, seed: int, device: str, planned: Call
     parts = (rng.permuted(np.tile(np.arange(draws), (len(names), 1)), axis=1) + rng.random((len(names), draws))) / draws
     drawn = [draw_parameters(file, 1.0, rng, quantiles=dict(zip(names, part, strict=True)))[0] for part in parts.T]
     worlds = [planned(replace(model, file=one)) for one in drawn]
+    if estimate:
+        worlds = [planned(None), *worlds]
 
     @lru_cache(_BATCHES)
     def batch(rows: tuple[int, ...]) -> World:
         return replace(joined_worlds([worlds[row] for row in rows or (0,)]), rolls_on=rolls_on)
 
-    return Worlds(batch=batch, draws=draws)
+    return Worlds(batch=batch, draws=len(worlds))

@@ -67,9 +67,10 @@ class HandController(PlanningController):
             factor = _friction(drawn) / _friction(model)
             return found.planning(world_of(drawn, task, found.chain, found.world.bodies[:-1], factor), step_s)
 
-        worlds = drawn_worlds(model, draws, seed, where, planned)
+        likely = task.planner.risk == "likely"
+        worlds = drawn_worlds(model, draws, seed, where, planned, likely)
         tracked = partial(planned, step_s=min(STEP_S, task.planner.step_s))
-        self._tracker = HandTracker(found, drawn_worlds(model, draws, seed, "cpu", tracked))
+        self._tracker = HandTracker(found, drawn_worlds(model, draws, seed, "cpu", tracked, likely))
         super().__init__(task.planner, worlds, solver_of(solver, Elites(task.planner.samples)), where, seed)
 
     def restart(self, seed: int) -> None:

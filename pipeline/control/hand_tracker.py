@@ -28,7 +28,10 @@ DRIFT = (0.0035, math.radians(6.0))
 in 20 ms."""
 LONGEST_S = 0.25
 """Time without a state after which the next one is believed as it is [s]."""
-DEGREES, MEMORY_S = 4.0, 3.0
+WINDOW_S = 0.2
+"""Time over which draws are compared: in a single command the motion under twice the friction differs by less than
+what no draw predicts, in this time by several times as much [s]."""
+DEGREES, MEMORY_S = 4.0, 12.0
 """Of the agreement of draws: degrees of freedom of Student's distribution of errors, which are not normal where
 contacts slip, and memory [s]."""
 
@@ -63,13 +66,22 @@ class _Ensemble:
         return place, turn, velocity, omega
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """Where each draw has the object now, predicted from a time on."""
+
+    since_s: float
+    motion: tuple[Tensor, ...]
+
+
 class HandTracker:
     """Follows the object from state to state, by the commands that were sent.
 
     Noisy poses are filtered by an ensemble Kalman filter (Evensen, "Sequential data assimilation with a nonlinear
     quasi-geostrophic model", 1994): some states are predicted by the model, so that contacts keep them out of the
     fingers, whose joints are known, and say how pose and velocities vary together. Where there are several draws of the
-    model, that whose predictions of the poses were best is used for these predictions, and for plans.
+    model, each predicts the motion over pieces of `WINDOW_S`, and that whose predictions of the poses were best is used
+    for the filter, and for plans.
 
     Args:
         hand: The task.
@@ -86,11 +98,12 @@ class HandTracker:
         """Forget everything, and begin with a seed."""
         self._rng = np.random.default_rng([seed, 5])
         self._known: _Ensemble | None = None
+        self._trial: _Trial | None = None
         self._disagreement = np.zeros(self._worlds.draws)
 
     @property
     def draw(self) -> int:
-        """The draw whose predictions were best; 0 before the first one."""
+        """The draw whose predictions were best; the first one before any."""
         return int(self._disagreement.argmin())
 
     def update(self, state: ControlState, sent: Targets | None) -> State:
@@ -110,6 +123,8 @@ class HandTracker:
         gone = math.inf if before is None else state.time_s - before.time_s
         if before is not None and sent is not None and 0 < gone <= LONGEST_S:
             found = self._corrected(before, found, state, sent)
+        else:
+            self._trial = None
         self._known = found
         place, turn, velocity, omega = (part[0].numpy() for part in found.mean)
         return self._hand.state(place, turn, found.joints, velocity, omega, found.speeds)
@@ -148,8 +163,9 @@ class HandTracker:
         """Return the states after the targets, under the best draw; count how well each draw predicts the mean."""
         count, draws, thing = len(known.position_m), self._worlds.draws, self._hand.object
         rows = (self.draw,) * count + tuple(range(draws)) if draws > 1 else ()
-        parts = [torch.cat((part, mean.expand(draws, -1))) if draws > 1 else part
-                 for part, mean in zip(known.motion, known.mean, strict=True)]  # fmt: skip
+        trial = self._trial or _Trial(known.time_s, tuple(mean.expand(draws, -1) for mean in known.mean))
+        parts = [torch.cat((part, tried)) if draws > 1 else part
+                 for part, tried in zip(known.motion, trial.motion, strict=True)]  # fmt: skip
         base = self._hand.state(parts[0][0], parts[1][0], known.joints, speeds=known.speeds)
         start = State(*(part.expand(len(parts[0]), *part.shape[1:]).clone() for part in base.tensors))
         for whole, part in zip(start.tensors, parts, strict=True):
@@ -157,12 +173,10 @@ class HandTracker:
         times = torch.as_tensor(sent.times_s - sent.times_s[0])
         command = JointCommand.targets(times[None], torch.as_tensor(sent.values_m)[None])
         motion = rollout(self._worlds.batch(rows), start, times[[0, -1]], {self._hand.chain.name: command})
-        position, quat, velocity, omega = (
-            part[:, -1, thing]
-            for part in (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
-        )
+        every = (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
+        position, quat, velocity, omega = (part[:, -1, thing] for part in every)
         if draws > 1:
-            self._weigh(position[count:], quat[count:], state, float(times[-1]))
+            self._tried(replace(trial, motion=tuple(part[count:, -1, thing] for part in every)), state)
         return replace(known, position_m=position[:count], quat_wxyz=quat[:count], velocity_m_s=velocity[:count],
                        omega_body_rad_s=omega[:count])  # fmt: skip
 
@@ -182,11 +196,19 @@ class HandTracker:
             found, position_m=rows[:, :3], quat_wxyz=quat, velocity_m_s=rows[:, 6:9], omega_body_rad_s=rows[:, 9:]
         )
 
-    def _weigh(self, position: Tensor, quat: Tensor, state: ControlState, gone_s: float) -> None:
+    def _tried(self, trial: _Trial, state: ControlState) -> None:
+        """Carry the predictions of the draws on; at the end of a piece, count how well each predicted the pose."""
+        gone_s = state.time_s - trial.since_s
+        over = gone_s >= WINDOW_S - 1e-9
+        self._trial = None if over else trial
+        if over:
+            self._weigh(trial, state, gone_s)
+
+    def _weigh(self, trial: _Trial, state: ControlState, gone_s: float) -> None:
         """Count how well each draw predicted a pose."""
         size2 = self._noise**2 + np.square(DRIFT) * gone_s
         place, aim = _pose(state)
-        away, turn = position - place, quat_turn(quat, aim)
+        away, turn = trial.motion[0] - place, quat_turn(trial.motion[1], aim)
         square = (away.square().sum(-1) / size2[0] + turn.square().sum(-1) / size2[1]).numpy()
         each = 0.5 * (DEGREES + 6) * np.log1p(np.nan_to_num(square, nan=1e6) / DEGREES)
         self._disagreement = self._disagreement * math.exp(-gone_s / MEMORY_S) + each

@@ -73,10 +73,11 @@ def test_noisy_poses_are_filtered_while_the_object_is_pushed(unsure: tuple[Path,
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_the_draw_that_predicts_the_motion_is_planned_with(unsure: tuple[Path, Model], factor: float) -> None:
     controller = HandController(unsure[1], hand_task(unsure[0]), draws=5)
+    estimate = float(controller.hand.world.contact.friction)
+    assert float(controller._planned_in().batch(()).contact.friction) == estimate  # nothing was seen
     errors = errors_while_pushing(controller, friction_factor=factor)
     np.testing.assert_allclose(errors, 0.0, atol=1e-7)  # exact poses are believed
-    draws = controller._tracker._worlds.batch(tuple(range(5))).contact.friction.flatten()
-    estimate = float(controller.hand.world.contact.friction)
+    draws = controller._tracker._worlds.batch(tuple(range(6))).contact.friction.flatten()
     chosen = float(controller._planned_in().batch(()).contact.friction)
     nearest = float(draws[(draws / estimate / factor).log().abs().argmin()])
     assert chosen == pytest.approx(nearest)
