@@ -109,6 +109,8 @@ class HandCostsSection(TaskSection):
     """Distance of the object from where it is wanted beyond which it may be lost [m]."""
     lost_m: Length = 0.01
     """A further distance that costs 1 [m]."""
+    reach_m: Length = 0.3
+    """A distance of the fingertips from the object that costs 1 [m], as a mean over fingers and horizon."""
     turn_deg: Annotated[float, Field(gt=0, le=3600)] = 30.0
     """An error of its turn that costs 1 [deg]."""
     path: Share = 1.0

@@ -79,11 +79,12 @@ class HandObjective:
         errors = torch.cat((place / costs.position_m, lost / costs.lost_m, turn / math.radians(costs.turn_deg)), -1)
         weight = torch.full((errors.shape[1],), costs.path / errors.shape[1], dtype=torch.float64)
         weight[-1] += 1.0
+        tips = self.hand.tips.places(motion)[:, 1:] - motion.position_m[:, 1:, None, self.hand.object]
+        reach = tips.flatten(1) / (costs.reach_m * math.sqrt(max(1, tips[0, ..., 0].numel())))
         speeds = targets.diff(dim=1) / torch.as_tensor(np.diff(self.times_s))[:, None]
         share = 1 / math.sqrt(speeds.shape[1] * speeds.shape[2])
-        return torch.cat(
-            ((errors * weight.sqrt()[:, None]).flatten(1), (share / costs.speed_rad_s * speeds).flatten(1)), -1
-        )
+        errors = (errors * weight.sqrt()[:, None]).flatten(1)
+        return torch.cat((errors, reach, (share / costs.speed_rad_s * speeds).flatten(1)), -1)
 
     def within_limits(self, values: Tensor) -> Tensor:
         """Return the targets (b, L + N, joints) [rad] of sequences (b, N, joints), within range and speed."""

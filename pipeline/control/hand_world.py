@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -24,6 +25,7 @@ from ..physics.contact_law import ContactLaw
 from ..physics.hull import Hull
 from ..physics.world import Body, State, World
 from ..sg_gs.link_hulls import Balls, link_hulls, rounded_hull, whole_hull
+from .fingertips import Fingertips
 from .horizon import Array
 from .task_world import free_object, require_metric, require_rigid, softened
 
@@ -63,6 +65,11 @@ class HandWorld:
     def chain(self) -> Chain:
         """The hand."""
         return self.world.chains[0]
+
+    @cached_property
+    def tips(self) -> Fingertips:
+        """The tips of the fingers."""
+        return Fingertips.of(self.world, self.chain)
 
     @property
     def span(self) -> Array:
