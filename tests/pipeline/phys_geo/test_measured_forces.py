@@ -8,11 +8,12 @@ import pytest
 import torch
 from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
+from cgwm.pipeline.geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
 from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate, PhysicsFit
 from cgwm.pipeline.phys_geo.tracks.force_fit import with_forces
 from cgwm.pipeline.phys_geo.tracks.measured_forces import force_noise, measured_forces
-from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics import Rollout, World
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import contact_parameters
 from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
@@ -40,23 +41,29 @@ def world() -> World:
     return replace(same, ground_material="wood", pair_laws={GROUND: law(0.5), FINGER: law(0.5)})
 
 
+def pushed(friction: float, sideways_m: float = 0.0) -> tuple[Track, Rollout]:
+    """Return the finger's path, along x at constant speed, and the motion of a box of a friction on the ground."""
+    times = np.arange(0, 0.61, 1 / 60)
+    path = np.stack((-HALF[0] - RADIUS - 0.001 + SPEED * times, np.full_like(times, sideways_m), 0 * times), -1)
+    path[:, 2] = HALF[2]
+    true = replace(world(), pair_laws={GROUND: law(friction), FINGER: law(0.3)})
+    start = state_of(
+        ((0, 0, HALF[2] - 1e-4), UPRIGHT, (0, 0, 0), (0, 0, 0)), (tuple(path[0]), UPRIGHT, (0,) * 3, (0,) * 3)
+    )
+    finger = Track(times, path, np.tile(UPRIGHT, (len(times), 1)))
+    return finger, roll_out(true, start, torch.as_tensor(times), {"finger": finger}, bool(sideways_m))
+
+
 def push(seed: int, sideways_m: float, noise: Noise = FINE) -> Episode:
     """A push along x at constant speed, of a finger at the middle or beside it, with its force.
 
     The track comes from the engine, the force at the middle from the closed form mu m g while the box moves.
     """
     rng = np.random.default_rng(seed)
-    times = np.arange(0, 0.61, 1 / 60)
-    path = np.stack((-HALF[0] - RADIUS - 0.001 + SPEED * times, np.full_like(times, sideways_m), 0 * times), -1)
-    path[:, 2] = HALF[2]
-    true = replace(world(), pair_laws={GROUND: law(FRICTION), FINGER: law(0.3)})
-    start = state_of(
-        ((0, 0, HALF[2] - 1e-4), UPRIGHT, (0, 0, 0), (0, 0, 0)), (tuple(path[0]), UPRIGHT, (0,) * 3, (0,) * 3)
-    )
-    finger = Track(times, path, np.tile(UPRIGHT, (len(times), 1)))
-    rollout = roll_out(true, start, torch.as_tensor(times), {"finger": finger}, bool(sideways_m))
+    finger, rollout = pushed(FRICTION, sideways_m)
+    times = finger.time_s
     position, quat = rollout.position_m[0, :, 0].numpy(), rollout.quat_wxyz[0, :, 0].numpy()
-    force = np.zeros_like(path)
+    force = np.zeros_like(position)
     if sideways_m:
         assert rollout.contacts is not None
         each = rollout.contacts.impulse_n_s[0, 1:, rollout.contacts.body_b == 1].sum(1).numpy() * 60
@@ -135,13 +142,41 @@ def test_a_fit_with_forces_finds_the_friction_of_the_ground() -> None:
     assert found.record.forces is not None and found.record.forces["converged"]
 
 
+def test_the_motion_of_a_slow_push_does_not_tell_the_friction_of_the_ground() -> None:
+    """How far the box springs off the finger does, by a tenth of a millimetre in the frame after the impact.
+
+    Of two pushes, the information of all frames on the logarithm of the friction, with all else known, is less than a
+    tenth of that of its prior where the noise is 1 mm, and several times as much where it is 0.1 mm.
+    """
+    high, low = (pushed(FRICTION * factor)[1] for factor in (1.05, 1 / 1.05))
+    moved = (high.position_m - low.position_m)[0, :, 0] / (2 * np.log(1.05))
+    turned = quat_log(quat_multiply(quat_conjugate(low.quat_wxyz), high.quat_wxyz))[0, :, 0] / (2 * np.log(1.05))
+    prior = 1 / contact_parameters(world())[0].prior[1] ** 2
+    coarse, fine = (
+        2 * float((moved / noise.position_m).square().sum() + (turned / noise.rotation_rad).square().sum())
+        for noise in (COARSE, FINE)
+    )
+    assert coarse < 0.1 * prior and fine > 2 * prior
+
+
 @pytest.mark.evidence
-def test_without_forces_the_motion_tells_it_no_better_than_to_a_factor() -> None:
+def test_without_forces_the_interval_holds_the_friction_and_is_wide() -> None:
     found = fitted(False)
     interval = parameter(found, "friction[aluminium,wood]").interval_95
     assert interval is not None and interval[0] < FRICTION < interval[1]
     assert interval[1] > 2.5 * interval[0]  # with forces the two differ by a hundredth
     assert found.record.forces is None
+
+
+@pytest.mark.evidence
+@pytest.mark.xfail(
+    raises=AssertionError,
+    strict=True,
+    reason="Within the noise the states of multiple shooting leave the finger, and a box that slides by itself without "
+    "becoming slower asks for little friction: the standard error is 0.74 of the prior's, the motion leaves 0.98 of it",
+)
+def test_without_forces_the_friction_is_called_not_observable() -> None:
+    assert parameter(fitted(False), "friction[aluminium,wood]").state == "not_observable"
 
 
 def test_noise_of_forces_is_that_of_their_second_differences() -> None:
