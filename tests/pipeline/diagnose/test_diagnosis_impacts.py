@@ -21,7 +21,7 @@ from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION
 from cgwm.pipeline.segments.candidates import Candidate, variants_of
-from cgwm.pipeline.segments.impact_fit import BASE, ImpactBase, ImpactProblem, fit_impacts
+from cgwm.pipeline.segments.impact_fit import BASE, ImpactBase, ImpactProblem, fit_impacts, fits_to_weighted
 from cgwm.pipeline.segments.impact_law import Impact, _cone, after_impact, point_velocity, rebound_speed, within_cone
 from cgwm.pipeline.segments.impact_velocities import Impacts, measured_impacts
 from cgwm.pipeline.segments.prepare import Prepared, prepare
@@ -201,6 +201,18 @@ def test_measured_impacts_tell_restitution_and_friction() -> None:
         place = BASE.index(parameter)
         assert abs(found.values[place] - math.log(truth)) < 3 * deviation[place] + 0.02
         assert deviation[place] < 0.1
+    weightless = fits_to_weighted(problem, start, np.zeros((1, len(impacts))), start + 0.2)[0]
+    width = np.array([p.prior[1] for p in BASE])
+    np.testing.assert_allclose(np.diag(weightless.information), 1 / width**2, rtol=1e-6)  # only the priors speak
+    np.testing.assert_allclose(weightless.values, start + 0.2, atol=1e-6)
+    high = torch.tensor([[p.limits[1] for p in BASE]], dtype=F64)
+    asked = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            ImpactProblem, "rows", lambda self, values: asked.append(values) or torch.zeros(len(values), 1, 6)
+        )
+        problem.linear(high)
+    assert bool((asked[0] <= high).all()) and bool((asked[0] < high).any(0).all())  # differences go inwards at a bound
 
 
 @pytest.mark.parametrize("fast", [pytest.param(False, marks=pytest.mark.evidence), True])

@@ -185,6 +185,36 @@ def test_a_double_pendulum_keeps_its_energy_for_ten_seconds() -> None:
     np.testing.assert_allclose(energy, float(energy[0]), atol=1e-3 * (float(energy[0]) - lowest))
 
 
+def test_reflected_inertia_adds_its_kinetic_energy() -> None:
+    speeds = torch.tensor([[2.0, -3.0]], dtype=F64)
+    zero, turn = torch.zeros(1, 3, dtype=F64), torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=F64)
+    motion = ChainMotion(zero, turn, zero, zero, torch.tensor([[0.4, -0.7]], dtype=F64), speeds)
+    plain, geared = (float(ChainDynamics(*double_pendulum(armature=size)).energy(motion, zero)) for size in (0.0, 0.01))
+    assert geared - plain == pytest.approx(0.5 * 0.01 * (4 + 9), rel=1e-12)
+
+
+@pytest.mark.parametrize("base", ["fixed", "driven", "free"])
+def test_links_that_push_each_other_are_of_one_branch(base: str) -> None:
+    """Two fingers on a palm, one behind a part that is welded on; a free palm passes every push on."""
+    names = ("one", "one_tip", "part", "two", "two_tip", "nail")
+    joints = (
+        Joint.of("a", "hinge", "one", "palm"),
+        Joint.of("b", "hinge", "one_tip", "one"),
+        Joint.of("c", "fixed", "part", "palm"),
+        Joint.of("d", "hinge", "two", "part"),
+        Joint.of("e", "slide", "two_tip", "two"),
+        Joint.of("f", "fixed", "nail", "two_tip"),
+    )
+    chain = Chain(name="hand", root="palm", base=base, joints=joints)
+    found = dict(zip(chain.links, chain.branches, strict=True))
+    fingers = [{found[name] for name in names if name.startswith(start)} for start in ("one", ("two", "nail"))]
+    if base == "free":
+        assert set(found.values()) == {0}
+    else:
+        assert fingers == [{chain.links.index("one")}, {chain.links.index("two")}]
+        assert found["palm"] == found["part"] == 0
+
+
 def servo(**numbers: float) -> tuple[World, State]:
     """Return one link on a servo that turns about z, without gravity along its motion."""
     bodies = (link("palm", 0.0), link("finger", 0.02))

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 from cgwm.pipeline.physics import PaperLaw, State, World, simulate
-from cgwm.pipeline.physics.checks import largest_step, require_apart
+from cgwm.pipeline.physics.checks import largest_step, overlaps, require_apart
+from cgwm.pipeline.physics.contact_law import damping_ratio_of
 from cgwm.pipeline.physics.effects import ActiveEffect, Effect, EffectParameter, Values
 from cgwm.pipeline.physics.rollout import require_finite
 from cgwm.schemas import InputDataError, NotConvergedError
@@ -123,3 +124,25 @@ def test_messages_about_a_world_name_the_file_of_its_model() -> None:
     world = replace(world_of(box_body(mass=-0.4)), source="m/model.json")
     with pytest.raises(InputDataError, match=r"^m/model.json: body 'box': mass is -0.4 kg"):
         simulate(world, HIGH, times(0.02))
+
+
+def test_the_depth_is_that_of_the_lowest_sphere_wherever_the_centre_of_mass_lies() -> None:
+    ball = replace(ball_body(), com=values(0.01, -0.02, 0.015)[None])
+    world = world_of(ball, replace(ball, name="other"))
+    start = state_of(((0, 0, 0.037), UP, (0, 0, 0), (0, 0, 0)), ((0.078, 0, 0.04), UP, (0, 0, 0), (0, 0, 0)))
+    depths = {(each.body, each.other): float(each.depth_m) for each in overlaps(world, start)}
+    between = 0.08 - math.hypot(0.078, 0.003)
+    assert depths == pytest.approx(
+        {("ball", "the ground"): 0.003, ("other", "the ground"): 0.0, ("ball", "body 'other'"): between}, abs=1e-12
+    )
+
+
+def test_a_law_at_the_edge_of_what_is_allowed_is_taken() -> None:
+    for contact in (PaperLaw.of_rows(values(0.0), values(0.5), values(0.0)), law(friction=0.0, damping_ratio=0.0)):
+        simulate(world_of(box_body(), contact=contact), HIGH, times(0.02))
+
+
+def test_restitutions_that_no_damping_gives_are_refused() -> None:
+    for wanted in (0.005, 1.0):
+        with pytest.raises(InputDataError, match=r"no damping ratio(.|\n)*0.005 < restitution < 1"):
+            damping_ratio_of(values(0.5, wanted))

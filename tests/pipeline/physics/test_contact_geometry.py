@@ -98,6 +98,9 @@ def test_work_grows_with_contacts_and_kept_frames() -> None:
     two = world_of(ball_body(0.04), ball_body(0.04, name="two"))
     parts = [rollout_part("search", world, (1.0, 0.5), 6, 4, 100).memory_bytes for world in (ball, two)]
     assert parts[1] == 2 * parts[0] == 2 * 4 * 100 * 13 * 8
+    few, nothing = (rollout_part("search", ball, spans, 1, 4, 100) for spans in ((1.0, 0.5), ()))
+    assert few.memory_bytes == 2 * 100 * 13 * 8  # no more are kept than there are
+    assert nothing.seconds == nothing.memory_bytes == 0 and "rollouts of up to 0 s" in nothing.what
 
 
 def test_the_distance_to_a_hull_is_that_to_its_support_function() -> None:

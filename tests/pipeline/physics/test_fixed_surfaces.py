@@ -12,6 +12,7 @@ from cgwm.pipeline.physics import engine, simulate
 from cgwm.pipeline.physics.contact_detection import Placed
 from cgwm.pipeline.physics.fixed_surface import FixedSurface
 from cgwm.pipeline.physics.surface_detection import all_surface_points
+from cgwm.pipeline.physics.surface_mesh import _closest
 from cgwm.schemas import InputDataError
 from helpers import fixed_surfaces as fixed
 from helpers.worlds import F64, ball_body, law, state_of, times, world_of
@@ -159,3 +160,19 @@ def test_a_ball_far_from_all_surfaces_flies() -> None:
     with torch.no_grad():
         found, expected = (simulate(one, state, times(0.1, 20)) for one in (world, free))
     assert torch.equal(found.position_m, expected.position_m)
+
+
+def test_the_nearest_place_of_a_triangle_is_on_it_and_nothing_of_it_is_nearer() -> None:
+    generator = torch.Generator().manual_seed(0)
+    corners = torch.randn(4, 3, 3, generator=generator, dtype=F64)
+    points = 2 * torch.randn(60, 3, generator=generator, dtype=F64)
+    offset, region = _closest(points, corners)
+    assert set(region.flatten().tolist()) == set(range(7))
+    foot = points[:, None] - offset
+    weights = torch.linalg.solve(corners.mT, foot[..., None])[..., 0]  # of the corners
+    assert float(weights.min()) > -1e-9
+    torch.testing.assert_close(weights.sum(-1), torch.ones(60, 4, dtype=F64))
+    first, second = torch.rand(2, 400, generator=generator, dtype=F64)
+    shares = torch.stack((1 - first.sqrt(), first.sqrt() * (1 - second), first.sqrt() * second), -1)
+    others = (points[:, None, None] - shares @ corners).norm(dim=-1).amin(-1)
+    assert bool((offset.norm(dim=-1) <= others + 1e-12).all())

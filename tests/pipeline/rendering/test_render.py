@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.cameras import distort
-from cgwm.pipeline.rendering import raster_host
+from cgwm.pipeline.rendering import composite_reference, raster_host
 from cgwm.pipeline.rendering.render import render
 
 EXACT = {"min_alpha": 0.0, "min_transmittance": 0.0}
@@ -243,6 +243,24 @@ def test_many_spheres_over_one_pixel():
     output = render(means, scales, opacities, features, view, K, 1, 1, min_transmittance=0.0)
     expected = (0.01 * 0.99 ** torch.arange(count, dtype=torch.float64) * features[:, 0]).sum()
     torch.testing.assert_close(output.features[0, 0, 0, 0], expected)
+
+
+@pytest.mark.parametrize(("least", "evaluated"), [(1e-4, 64), (0.0, 160)])
+def test_what_lies_behind_an_opaque_pixel_is_not_evaluated(monkeypatch, least, evaluated):
+    """Of opacity 0.25, 33 spheres in a row leave less than 1e-4; what comes after that chunk of 32 is left out."""
+    monkeypatch.setattr(raster_host, "supported", lambda _: False)
+    seen = []
+    evaluate = composite_reference._evaluate
+    monkeypatch.setattr(composite_reference, "_evaluate", lambda *all: seen.append(all[3].shape[1]) or evaluate(*all))
+    means = torch.zeros(160, 3, dtype=torch.float64)
+    means[:, 2] = torch.linspace(1, 2, 160, dtype=torch.float64)
+    opacities = torch.full((160,), 0.25, dtype=torch.float64)
+    features, scales = torch.ones(160, 1, dtype=torch.float64), torch.full((160,), 0.1, dtype=torch.float64)
+    K = torch.tensor([[[10.0, 0, 0.5], [0, 10, 0.5], [0, 0, 1]]], dtype=torch.float64)
+    view = torch.eye(4, dtype=torch.float64)[None]
+    output = render(means, scales, opacities, features, view, K, 1, 1, min_transmittance=least)
+    assert sum(seen) == evaluated
+    assert float(output.alpha) == pytest.approx(1, abs=1e-4)
 
 
 @pytest.mark.parametrize("tile_size", [4, 16])
