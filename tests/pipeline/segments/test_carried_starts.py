@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.segments.carried_starts import carried_starts
+from cgwm.pipeline.segments.carried_starts import Beginning, _shape, _step, carried_starts
 from cgwm.pipeline.segments.release_detection import find_releases
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -54,3 +54,20 @@ def test_what_acts_all_along_the_flight_carries_nothing(effects: Mapping[str, Ma
 def test_a_step_down_is_the_rounded_beginning_of_an_impact() -> None:
     world = world_with("ball")
     assert carried_starts(world, whole_episodes(world, carried(thrown(), -20.0 * UP)), NOISE) == {}
+
+
+@pytest.mark.parametrize("width_s", [0.0, 0.01, 0.03])
+def test_the_step_of_a_release_is_found_through_the_filter_that_rounds_it(width_s: float) -> None:
+    """The path of an acceleration that ends, convolved with a normal density, beside a free flight."""
+    times, release, size = np.arange(40) / 100, 0.12, 30.0
+    fine = np.linspace(-6, 6, 2001)
+    density = np.exp(-0.5 * fine**2) / np.exp(-0.5 * fine**2).sum()
+    ahead = (release - times[:, None] + width_s * fine).clip(0.0)
+    carried = size * (0.5 * ahead**2 @ density)
+    np.testing.assert_allclose(size * _shape(release - times, width_s), carried, atol=1e-7)
+    up, along = np.array([0.0, 0.0, 1.0]), np.array([0.6, 0.0, 0.8])
+    places = 0.3 + times[:, None] * [1.0, 0.5, 2.0] - 0.5 * 9.81 * times[:, None] ** 2 * up + carried[:, None] * along
+    begun = Beginning(episode=0, frames=np.arange(40), times_s=times, places_m=places, airborne=True, up=up)
+    found = _step(begun, width_s)
+    assert (found.release_s, found.size_m_s2) == (pytest.approx(release), pytest.approx(size, rel=1e-3))
+    assert np.abs(found.residual_m).max() < 1e-5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -92,6 +93,18 @@ def test_a_pull_takes_its_work_from_a_rebound() -> None:
     assert float(pulled) < float(plain)
     slow = rebound_speed(impact([0.0, 0.0, -0.02, 0, 0, 0]), contact, [ActiveEffect.of(adhesion.effect, {"F": 50.0})])
     assert float(slow) == 0.0
+
+
+def test_a_pull_weighs_on_the_contact_and_does_work_on_the_way_in_and_out() -> None:
+    """With F (1 - (h / g)^2)^2 within the gap g the work is 8/15 F g."""
+    force, gap, speed = 2.0, 0.002, 0.3
+    adhesion = ActiveEffect.of(load_effect("adhesion"), {"F": force, "g": gap})
+    contact = law(0.3, 0.002, 0.1)
+    found = float(rebound_speed(impact([0.0, 0.0, -speed, 0, 0, 0]), contact, [adhesion]))
+    work = 8 / 15 * force * gap / MASS
+    heavy = impact([0.0, 0.0, -math.hypot(speed, math.sqrt(2 * work)), 0, 0, 0], weight=force / MASS)
+    expected = math.sqrt(float(rebound_speed(heavy, contact, [])) ** 2 - 2 * work)
+    assert found == pytest.approx(expected, rel=2e-3)
 
 
 def test_a_ball_that_grips_keeps_five_sevenths_and_one_that_slides_loses_the_friction() -> None:
