@@ -240,3 +240,17 @@ def test_a_hand_of_160_spheres_and_two_objects_of_250_stay_in_the_kernel() -> No
     objects = [replace(ball_body(0.01, name=name, copies=250)) for name in ("one", "two")]
     world = chained(Chain(name="hand", root="palm", base="fixed", joints=joints), *bodies, *objects)
     assert reason_against(world) is None
+
+
+@pytest.mark.parametrize("kind", ["fixed", "hinge", "slide"])
+def test_a_row_of_the_table_is_as_wide_as_the_kernel_reads(kind: str) -> None:
+    """Also of a chain of which no joint moves."""
+    joints = (Joint.of("a", kind, "one", "base"), Joint.of("b", "fixed", "two", "one"))
+    chain = Chain(name="arm", root="base", base="driven", joints=joints)
+    world = chained(chain, link("base", 0.0), link("one", 0.1), link("two", 0.1), ball_body(0.02))
+    path = Drive.from_velocities(
+        batch([0.0, 0.1]), torch.zeros(1, 3, dtype=F64), batch([1.0, 0.0, 0.0, 0.0]), torch.zeros(1, 1, 3, dtype=F64),
+        torch.zeros(1, 1, 3, dtype=F64),
+    )  # fmt: skip
+    packed = pack(world, still(4), times(0.01), {"base": path}, False)
+    assert packed.table.shape[-1] == packed.structure.table_width
