@@ -32,6 +32,9 @@ ROWS = {
     "CEM + MuJoCo + R, learned shape, 1x": "CEM, learned shape",
     "cgwm, geometry refined": "geometry refined",
     "PIN-WM": "PIN-WM",
+    "PIN-WM, 4x": "PIN-WM, 4x",
+    "DreamerV3, 100 true trajectories": "DreamerV3",
+    "DreamerV3, 100 true trajectories, 4x": "DreamerV3, 4x",
 }
 """Rows of the page, in its order, and their names there."""
 TASKS = ("fall", "push", "tip")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,7 @@ class Latent:
         if self.solid is None:
             data = filmed(training, find_poses(training, cell))
         else:
-            data = self._simulated(training, cameras, cell, self.solid(cell.capture))
+            data = simulated(training, cameras, cell, self.solid(cell.capture), self.trajectories)
             left = stopwatch(budget_s)
         made_s = time.perf_counter() - began
         with torch.random.fork_rng(devices=[]):
@@ -107,24 +108,25 @@ class Latent:
             "loss": [round(float(np.mean(part)), 4) for part in (losses[:10], losses[-10:]) if part],
             "parameters": {},
         }  # fmt: skip
-        return FittedLatent(model.eval(), training.world, cameras, _frame_s(training), record)
+        return FittedLatent(partial(predicted, model.eval()), training.world, cameras, frame_s(training), record)
 
-    def _simulated(self, training: Training, cameras: Cameras, cell: Cell, solid: SolidObject) -> Sequences:
-        """Return trajectories with ground truth, and what the cameras see of them."""
-        true = read_truth(cell.capture).contact
-        world, times = training.world, np.asarray(_frame_s(training) * np.arange(TEST_FRAMES), np.float64)
-        index, pushed = world.free[0], bool(training.drives)
-        tip = true.friction if true.friction_fingertip is None else true.friction_fingertip
-        contact = ContactTruth(
-            friction=true.friction,
-            friction_fingertip=tip,
-            natural_time=true.natural_time_s,
-            damping_ratio=true.damping_ratio,
-            impedance=true.impedance,
-        )
-        down = -matrix_from_quat(np.asarray(training.model.file.bodies[index].photo_pose.quat_wxyz))[2]
-        ways = draw_trajectories(solid, contact, down, pushed, self.trajectories, times, cell.seed)
-        return _stacked([_filmed_trajectory(way, world, cameras) for way in ways], cell.device)
+
+def simulated(training: Training, cameras: Cameras, cell: Cell, solid: SolidObject, count: int) -> Sequences:
+    """Return so many trajectories of the true solid with ground truth, and what the cameras see of them."""
+    true = read_truth(cell.capture).contact
+    world, times = training.world, np.asarray(frame_s(training) * np.arange(TEST_FRAMES), np.float64)
+    index, pushed = world.free[0], bool(training.drives)
+    tip = true.friction if true.friction_fingertip is None else true.friction_fingertip
+    contact = ContactTruth(
+        friction=true.friction,
+        friction_fingertip=tip,
+        natural_time=true.natural_time_s,
+        damping_ratio=true.damping_ratio,
+        impedance=true.impedance,
+    )
+    down = -matrix_from_quat(np.asarray(training.model.file.bodies[index].photo_pose.quat_wxyz))[2]
+    ways = draw_trajectories(solid, contact, down, pushed, count, times, cell.seed)
+    return _stacked([_filmed_trajectory(way, world, cameras) for way in ways], cell.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,9 +193,13 @@ def _rendered(view: Camera, spheres: Spheres, means: Tensor) -> tuple[Tensor, Te
 
 @dataclass(frozen=True, eq=False)
 class FittedLatent:
-    """The trained model; frame_s: time from one of its frames to the next [s]."""
+    """A trained model; frame_s: time from one of its frames to the next [s].
 
-    model: LatentModel
+    ahead: returns positions (S, T, 3), rotations (S, T, 3, 3) and images (S, T, C, H, W) of sequences, open loop from
+    their first frames.
+    """
+
+    ahead: Callable[[Sequences], tuple[Tensor, Tensor, Tensor]]
     world: World
     cameras: Cameras
     frame_s: float
@@ -223,7 +229,7 @@ class FittedLatent:
             known=torch.ones(len(grid), dtype=torch.bool),
         )
         position, rotation, images = (
-            values[0].cpu() for values in predicted(self.model, _stacked([data], self.model.mean_image.device))
+            values[0].cpu() for values in self.ahead(_stacked([data], self.cameras.spheres.means.device))
         )
         place, quat = _interpolated(grid, position.double(), matrix_to_quat(rotation.double()), times_s)
         position_m, quat_wxyz = (values.numpy() for values in kinematic_poses(self.world, drives, times_s))
@@ -329,6 +335,6 @@ def _driven(world: World) -> list[int]:
     return [index for index, body in enumerate(world.bodies) if body.motion == "driven"]
 
 
-def _frame_s(training: Training) -> float:
+def frame_s(training: Training) -> float:
     """Return the time from one frame of a camera to the next [s]."""
     return float(np.median(np.diff(training.footage.videos[0].times_s)))

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from cgwm.datasets.synthetic.objects import SolidObject
+from rivals.dreamer import DreamerV3
+from rivals.pinwm import PinWmItself
 
 from .base import Contender
 from .cem_mujoco import CemMujoco
@@ -24,10 +27,14 @@ REFERENCE = "cgwm"
 
 @dataclass(frozen=True)
 class Row:
-    """A contender, and its budget in units of the reference's fit time; None: it takes the time that it takes."""
+    """A contender, and its budget in units of the reference's fit time; None: it takes the time that it takes.
+
+    fetched: it is a rival's own code, which has to be fetched (docs/rivals.md), and runs where it is asked for alone.
+    """
 
     make: Callable[[], Contender]
     budget: float | None = None
+    fetched: bool = False
 
 
 def true_solid(capture: Path) -> SolidObject:
@@ -55,6 +62,12 @@ def _paper(budget: float) -> tuple[str, Row]:
 def _latent(data: str, solid: Callable[[Path], SolidObject] | None, budget: float) -> tuple[str, Row]:
     name = f"latent, {data}, {budget:g}x"
     return name, Row(lambda: Latent(name, solid), budget)
+
+
+def _fetched(name: str, make: Callable[[str], Contender]) -> list[tuple[str, Row]]:
+    """Return the rows of a rival itself: as long as it takes, and four times the reference's time."""
+    rows = ((name, None), (f"{name}, 4x", 4.0))
+    return [(shown, Row(partial(make, shown), budget, fetched=True)) for shown, budget in rows]
 
 
 def _true(part: Part) -> tuple[str, Row]:
@@ -88,6 +101,8 @@ ROWS: dict[str, Row] = dict(
         _true("shape"),
         _true("mass"),
         _true("poses"),
+        *_fetched("PIN-WM", PinWmItself),
+        *_fetched("DreamerV3, 100 true trajectories", lambda name: DreamerV3(name, true_solid)),
     )
 )
 """By name, in the table's order."""
