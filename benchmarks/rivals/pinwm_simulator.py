@@ -25,6 +25,10 @@ STILL, STILL_STEPS = 1e-4, 10
 """A body this slow [m/s, 10 rad/s] for so many steps is at rest: what is predicted stays."""
 
 
+FAILURES = (ArithmeticError, RuntimeError, TypeError, ValueError)
+"""What its solver dies of: it has no error of its own."""
+
+
 class Simulator:
     """The scene.
 
