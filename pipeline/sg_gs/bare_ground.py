@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ...datasets.io.progress import note
 from ...schemas import GroundShadow
-from ..geometry.ground_spheres import NODE_WEIGHTS, NODES, dimmed, on_plane
+from ..geometry.ground_spheres import NODE_WEIGHTS, NODES, THIN, dimmed, on_plane
 from ..geometry.solid_grid import Array
 from ..geometry.spheres import Spheres
 from .cast_shadow import CastShadow, find_shadow
@@ -31,8 +31,9 @@ _LARGEST = 0.15
 _INPAINT_CELLS = 5
 _SPACING_CELLS, _SCALE_CELLS = 2, 1.3
 """Distance and scale of the spheres that fill hidden ground, in cells."""
-_SUNK = 2.0
-"""Depth of their centres below the ground, in scales: on it they would cover the foot of a body that moves there."""
+_SUNK = 0.9 * THIN
+"""Depth of their centres below the ground, in scales: on it they would cover the foot of a body that moves there, and
+deeper they would no longer count as spheres of the ground, which shadows dim."""
 _GAP_CELLS = 2
 
 

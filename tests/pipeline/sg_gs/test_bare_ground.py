@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from cgwm.pipeline.geometry.ground_spheres import on_plane
 from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.sg_gs import bare_ground as ground_module
 from cgwm.pipeline.sg_gs.cast_shadow import find_shadow
@@ -88,4 +89,5 @@ def test_the_shadow_is_lifted_from_the_ground_alone_and_hidden_ground_is_covered
     new = filled.means[:, 2].numpy() < -1e-6
     depth = -filled.means[new, 2] / filled.scales[new]
     assert new.sum() > 50
-    assert float((filled.opacities[new] * torch.exp(-0.5 * depth**2)).max()) < 0.15
+    assert float((filled.opacities[new] * torch.exp(-0.5 * depth**2)).max()) < 0.2
+    assert on_plane(filled.means[new], torch.tensor([0.0, 0, 1]), 0.0, filled.scales[new], 0.1).all()
