@@ -15,7 +15,7 @@ from ..geometry.spheres import Spheres
 from ..rendering.contact_sheets import SHEET_BYTES, compared, small_png
 from ..rendering.image_metrics import psnr, ssim_map
 from .camera_refinement import find_motion, moved
-from .photo_exposure import least_squares_gain
+from .photo_exposure import Exposures, least_squares_gain
 from .views import COVERED, View, as_bytes, camera_center, render_view
 
 
@@ -24,16 +24,25 @@ class HeldOut:
     """Quality of the fit on held-out photos."""
 
     figures: dict[str, Any]
-    """Means over the photos, for fit.json: `psnr_db` and `ssim` of the whole picture, `psnr_object_db` and `mask_iou`
-    where masks show a body; `psnr_right_half_db` of the right half of each picture; and
-    `psnr_right_half_corrected_db` of the same with the exposure of the photo (and its pose, where poses were refined)
-    estimated on its left half, which excludes differences between photos that are no error of the scene."""
+    """Means over the photos, for fit.json: `psnr_db` and `ssim` of the whole picture, with the exposure that is
+    expected of a photo; `psnr_object_db` and `mask_iou` where masks show a body; `psnr_right_half_db` of the right half
+    of each picture; and `psnr_right_half_corrected_db` of the same with the exposure of the photo (and its pose, where
+    poses were refined) estimated on its left half, which excludes differences between photos that are no error of the
+    scene."""
     sheet: bytes | None
     """Contact sheet, PNG, or None without photos."""
 
 
 @torch.no_grad()
-def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, spread: float, *, poses: bool) -> HeldOut:
+def look(
+    views: Sequence[View],
+    bodies: list[Spheres],
+    scene: Spheres | None,
+    spread: float,
+    *,
+    poses: bool,
+    exposures: Exposures | None = None,
+) -> HeldOut:
     """Compare held-out photos with renders of the spheres.
 
     Args:
@@ -42,6 +51,7 @@ def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, sp
         scene: The background, or None.
         spread: Size of the cameras' arrangement [m].
         poses: Whether the cameras of the fitted photos were refined.
+        exposures: Gains of the fitted photos, if they were learned.
     """
     everything = Spheres.joined([*bodies, *([] if scene is None else [scene])])
     label = torch.zeros(len(everything), 1, device=everything.means.device)
@@ -52,7 +62,7 @@ def look(views: Sequence[View], bodies: list[Spheres], scene: Spheres | None, sp
         seen = everything.seen_from(camera_center(view.viewmat))
         colored = Spheres(seen.means, seen.scales, seen.opacities, torch.cat([seen.colors, label], 1))
         features = render_view(colored, view).features[0]
-        plain = features[..., :3]
+        plain = features[..., :3] if exposures is None else features[..., :3] * exposures.expected(view.name)
         picture = plain.clamp(0, 1)
         pictures.append(as_bytes(picture))
         whole.append(psnr(picture, view.image, view.seen))

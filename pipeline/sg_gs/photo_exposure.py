@@ -14,6 +14,8 @@ from .views import View
 _FOLLOWING = 0.3
 """Share of the way to the least-squares gain that the gain of a photo moves each time the photo is rendered."""
 _LEAST, _MOST = 0.1, 10.0
+_FEWEST = 3
+"""Fewest fitted photos that tell the exposure of another."""
 
 
 class Exposures:
@@ -54,6 +56,31 @@ class Exposures:
     def even(self, view: View) -> View:
         """Return a photo scaled to the mean exposure."""
         return replace(view, image=view.image / self.gain(view)) if self.learned else view
+
+    def expected(self, name: str) -> Tensor:
+        """Return the gain (3,) to expect of a photo that took no part: in between those of its neighbours by name.
+
+        Names follow time, and exposures too where a camera sets them by itself. Where the fitted photos' own gains are
+        told no better so than by their mean, it is 1.
+        """
+        names = sorted({*self._place, name})
+        known = [(rank, self._place[one]) for rank, one in enumerate(names) if one in self._place]
+        if len(known) < _FEWEST:
+            return torch.ones_like(self._log_gains[0])
+        told = torch.stack([self._between(known[:k] + known[k + 1 :], rank) for k, (rank, _) in enumerate(known)])
+        own = torch.stack([self._log_gains[row] for _, row in known])
+        if (told - own).square().sum() >= own.square().sum():
+            return torch.ones_like(own[0])
+        return self._between([one for one in known if names[one[0]] != name], names.index(name)).exp()
+
+    def _between(self, known: Sequence[tuple[int, int]], rank: int) -> Tensor:
+        """Return the logarithm of the gain (3,) at a rank of names, from `known` ranks and rows, in rising order."""
+        before = [one for one in known if one[0] < rank][-1:]
+        after = [one for one in known if one[0] > rank][:1]
+        if not before or not after:
+            return self._log_gains[(before or after)[0][1]]
+        (first, low), (last, high) = before[0], after[0]
+        return torch.lerp(self._log_gains[low], self._log_gains[high], (rank - first) / (last - first))
 
     def record(self) -> dict[str, list[float]]:
         """Return the gains by photo, for fit.json."""

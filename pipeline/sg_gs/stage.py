@@ -130,7 +130,8 @@ def _checked(stage: Stage, bodies: list[Spheres], scene: Spheres | None) -> dict
     """Record the errors on held-out photos; return their contact sheet and the turntable film by file name."""
     config, pictures = stage.config, {}
     note("sg-gs: held-out photos")
-    held_out = look(stage.test, bodies, scene, stage.spread, poses=config.refine_poses)
+    learned = stage.exposures if config.exposure else None
+    held_out = look(stage.test, bodies, scene, stage.spread, poses=config.refine_poses, exposures=learned)
     if config.exposure:
         stage.record["exposure_gain_rgb"] = stage.exposures.record()
     stage.record["held_out"] = held_out.figures

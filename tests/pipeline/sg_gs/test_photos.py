@@ -338,3 +338,15 @@ def test_what_an_undistorted_photo_does_not_show_counts_nowhere() -> None:
     edge = means[:, 0] < -1.1
     assert float(blind[edge].mean()) < 0.5 * float(colors[edge].mean())
     assert float(pull[edge].abs().max()) < 1e-6
+
+
+def test_the_exposure_of_a_held_out_photo_is_that_between_its_neighbours(views):
+    names = [f"{k:03d}.jpg" for k in range(0, 24, 2)]
+    exposures = Exposures([replace(views[0], name=name) for name in names], learned=True)
+    smooth = torch.sin(torch.linspace(0, 3, 12))[:, None] * torch.tensor([0.1, 0.2, 0.3])
+    exposures.restore({"log_gains": smooth})
+    assert torch.allclose(exposures.expected("009.jpg"), (0.5 * (smooth[4] + smooth[5])).exp())
+    assert torch.allclose(exposures.expected("007x.jpg"), (0.5 * (smooth[3] + smooth[4])).exp())
+    assert torch.allclose(exposures.expected("999.jpg"), smooth[-1].exp())
+    exposures.restore({"log_gains": torch.tensor([0.3, -0.3] * 6)[:, None].expand(12, 3)})  # no photo is like the next
+    assert torch.equal(exposures.expected("009.jpg"), torch.ones(3))
