@@ -53,3 +53,9 @@ def test_a_sphere_of_the_hidden_side_is_as_bright_as_the_side_that_is_seen(turn:
     assert torch.equal(seen[~changed], (own * albedo)[~changed])
     both = placed.seen(own * albedo, world, rotation @ torch.tensor([1.0, 0.0, 1.0]))  # both sides are seen
     assert torch.equal(both, own * albedo)
+    twice = edges.placed(LIGHT, torch.stack([rotation, torch.eye(3)]))  # views at once are as one by one
+    eye = torch.tensor([-0.5, 0.0, 1.0])
+    places = torch.stack([world, means])
+    together = twice.seen((own * albedo).expand(2, -1, -1), places, eye)
+    for k in range(2):
+        assert torch.equal(together[k], twice.view(k).seen(own * albedo, places[k], eye))
