@@ -37,7 +37,8 @@ from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.diagnose import diagnose
-from cgwm.pipeline.evaluate.stage import Evaluation, evaluate_model
+from cgwm.pipeline.evaluate.evaluation import Evaluation
+from cgwm.pipeline.evaluate.stage import evaluate_model
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.effects.registry import FLIGHT_ALIASES

@@ -15,8 +15,9 @@ from pathlib import Path
 
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.evaluate.evaluation import EpisodeEvaluation
 from cgwm.pipeline.evaluate.frame_strips import strips_of
-from cgwm.pipeline.evaluate.stage import EpisodeEvaluation, evaluate_model
+from cgwm.pipeline.evaluate.stage import evaluate_model
 from cgwm.pipeline.rendering.contact_sheets import contact_sheet, small_png, telling, tiles
 
 MOMENTS = 7

@@ -26,7 +26,7 @@ from cgwm.datasets.importers.jugglebot import import_jugglebot
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.compare.model_comparison import ComparedModel
 from cgwm.pipeline.compare.stage import compare_models
-from cgwm.pipeline.evaluate.stage import Evaluation
+from cgwm.pipeline.evaluate.evaluation import Evaluation
 from cgwm.pipeline.fit import fit
 from cgwm.schemas import PhysConfig
 from store import Store, shared_data

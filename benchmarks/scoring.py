@@ -14,10 +14,10 @@ from cgwm.datasets.models.model import Model, read_model
 from cgwm.datasets.synthetic import TruthFile, read_truth
 from cgwm.pipeline.demo.truth_tables import OBJECT, true_parameters
 from cgwm.pipeline.evaluate.episode_errors import episode_errors
+from cgwm.pipeline.evaluate.evaluation import EpisodeEvaluation
 from cgwm.pipeline.evaluate.frame_strips import strips_of
 from cgwm.pipeline.evaluate.image_errors import VideoErrors
 from cgwm.pipeline.evaluate.prediction import MODEL, EpisodePrediction, Motion
-from cgwm.pipeline.evaluate.stage import EpisodeEvaluation
 from cgwm.pipeline.phys_geo.images.video_exposure import estimate_exposures
 from cgwm.pipeline.physics.world import State
 from cgwm.pipeline.rendering.contact_sheets import FrameStrip

@@ -161,7 +161,7 @@ from .model import (
 from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
 from .plan import Distribution, RejectionRules, SamplingPlan, plan_toml, read_plan
 from .pose import QUATERNION_NORM_TOLERANCE, Pose
-from .results import EpisodeErrors, ErrorSummary, EvalResult, KeptOutput
+from .results import EpisodeErrors, ErrorSummary, EvalResult, FilmedErrors, KeptOutput, Reference
 from .surfaces import Surface
 from .validation import Failure, ValidationReport
 from .view import ViewReport
@@ -235,6 +235,7 @@ __all__ = [
     "Failure",
     "FileModel",
     "FileShape",
+    "FilmedErrors",
     "FitChoice",
     "FitFile",
     "FittedParameter",
@@ -301,6 +302,7 @@ __all__ = [
     "ProposedMotion",
     "Provenance",
     "RankedEffect",
+    "Reference",
     "RejectionRules",
     "Remaining",
     "ResidualLaw",

@@ -24,8 +24,10 @@ PIPELINE: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("kernels", ("physics", "rendering")),
     ("kernels", ("trajectories",)),
     ("kernels", ("segments",)),
-    ("stages", ("mask", "calibrate", "sg_gs", "synthesize", "evaluate", "diagnose", "validate")),
-    ("stages", ("phys_geo", "compare", "control", "view", "export")),
+    ("stages", ("mask", "calibrate", "sg_gs", "synthesize", "diagnose", "validate")),
+    ("stages", ("phys_geo", "view", "export")),
+    ("stages", ("evaluate",)),
+    ("stages", ("compare", "control")),
     ("chains", ("fit",)),
     ("chains", ("demo", "improve")),
 )

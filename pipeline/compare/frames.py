@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ...datasets.capture.capture import Capture
+from ..evaluate.evaluation import EpisodeEvaluation
 from ..evaluate.frame_strips import strips_of
 from ..evaluate.image_errors import VideoErrors
 from ..evaluate.prediction import MODEL
-from ..evaluate.stage import EpisodeEvaluation
 from ..rendering.contact_sheets import FrameStrip, Image, jpeg_uri, tiles
 from ..runtime.device import resolve_device
 from .model_comparison import ComparedModel

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...datasets.models.model import Model
 from ...schemas import PHASES, CovariateShare, ModelComparison, Phase, PhaseFigures, WorstMoment
-from ..evaluate.stage import Evaluation
+from ..evaluate.evaluation import Evaluation
 from ..trajectories.track_noise import Noise
 from .residual_wrenches import WrenchPoint
 from .short_horizon_errors import FREEDOMS, ShortErrors

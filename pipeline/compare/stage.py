@@ -15,8 +15,9 @@ from ...datasets.io.progress import note, progress
 from ...datasets.models.model import Model, read_model
 from ...schemas import CompareResult, InputDataError, PairedDifference, UsageError
 from ...schemas.regular_files import real_path
+from ..evaluate.evaluation import Evaluation
 from ..evaluate.prediction import STATE_FIT_EPISODES
-from ..evaluate.stage import Evaluation, check_bodies, evaluate_model
+from ..evaluate.stage import check_bodies, evaluate_model
 from ..evaluate.work import LESS, evaluation_parts
 from ..physics.rollout_cost import durations, segment_part
 from ..physics.world import State, World

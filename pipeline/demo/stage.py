@@ -28,8 +28,9 @@ from ...schemas import (
     SynthesizeConfig,
 )
 from ..calibrate.stage import calibrate
+from ..evaluate.evaluation import Evaluation
 from ..evaluate.frame_strips import strips_of
-from ..evaluate.stage import Evaluation, evaluate_model
+from ..evaluate.stage import evaluate_model
 from ..fit import fit
 from ..rendering.contact_sheets import RolloutTile, contact_sheet, small_png, telling, tiles
 from ..runtime.device import resolve_device

@@ -9,9 +9,9 @@ import numpy as np
 from ...datasets.capture.capture import Capture
 from ..rendering.contact_sheets import FrameStrip, Image
 from ..rendering.video_view import video_view
+from .evaluation import EpisodeEvaluation
 from .image_errors import VideoComparison
 from .prediction import EpisodePrediction
-from .stage import EpisodeEvaluation
 
 
 def strips_of(episodes: Sequence[EpisodeEvaluation], capture: Capture) -> list[FrameStrip]:

@@ -1,7 +1,8 @@
-"""Image errors of predicted motions: PSNR of the frame and of the object, and SSIM of the frame."""
+"""Image errors of predicted motions: PSNR of the frame and of the object, SSIM of the frame, and silhouettes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +17,7 @@ from ..rendering.image_metrics import ssim_map
 from ..rendering.label_renderer import LabelRenderer
 from ..rendering.video_view import expose, video_view
 from .prediction import MODEL, EpisodePrediction, Motion
+from .silhouette_errors import SilhouetteErrors, silhouette_errors
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -39,6 +41,10 @@ class VideoComparison:
     empty."""
     ssim: dict[str, Array]
     """Structural similarity of the whole frame by method [1], shape (F,)."""
+    silhouettes: dict[str, SilhouetteErrors]
+    """Errors of the silhouettes by method; empty without true masks."""
+    cameras: Sequence[Camera]
+    """Camera of each frame, without distortion."""
     true_masks: bool
     """Whether the true mask is known; without it the union is the predicted mask alone."""
     real: Image | None = None
@@ -55,8 +61,8 @@ class _Footage:
     """Times of the frames [s], shape (F,)."""
     images: Image
     """Frames, uint8 RGB, shape (F, H, W, 3)."""
-    objects: NDArray[np.bool_] | None
-    """True masks of the free bodies, shape (F, H, W), or None."""
+    objects: NDArray[np.uint8] | None
+    """True masks: 0, or k for the k-th free body, counted from 1, shape (F, H, W); or None."""
     valid: NDArray[np.bool_]
     """Pixels that the original frames cover, shape (H, W)."""
     cameras: list[Camera]
@@ -90,12 +96,15 @@ class VideoErrors:
         psnr: dict[str, Array] = {}
         object_psnr: dict[str, Array] = {}
         ssim: dict[str, Array] = {}
+        silhouettes: dict[str, SilhouetteErrors] = {}
         shown: Image | None = None
         for method, motion in prediction.motions.items():
             pictures, labels = self._render(footage, camera, motion, at)
             exposed = expose(pictures, exposure)
-            psnr[method], object_psnr[method] = self._ratios(footage, exposed, labels)
+            psnr[method], object_psnr[method] = self._ratios(footage, exposed, labels > 0)
             ssim[method] = self._similarities(footage, exposed)
+            if footage.objects is not None:
+                silhouettes[method] = silhouette_errors(footage.objects, labels, footage.valid, len(prediction.bodies))
             if method == MODEL and self.keep_frames:
                 shown = (exposed * 255).round().astype(np.uint8)
         real = footage.images if self.keep_frames else None
@@ -106,6 +115,8 @@ class VideoErrors:
             psnr_db=psnr,
             psnr_object_db=object_psnr,
             ssim=ssim,
+            silhouettes=silhouettes,
+            cameras=footage.cameras,
             true_masks=known,
             real=real,
             predicted=shown,
@@ -124,9 +135,8 @@ class VideoErrors:
         images = np.stack([view.undistorted(frames[k])[0] for view, k in zip(views, chosen, strict=True)])
         objects = None
         if masks is not None:
-            labels = [k + 1 for k, name in enumerate(capture.body_names) if name in prediction.bodies]
             plain = [view.undistorted(masks[k], labels=True)[0] for view, k in zip(views, chosen, strict=True)]
-            objects = np.isin(np.stack(plain), labels)
+            objects = _numbered(np.stack(plain), [capture.body_names.index(name) + 1 for name in prediction.bodies])
         inside = views[0].undistorted(np.full(frames.shape[1:3], 255, np.uint8))[0] == 255
         return _Footage(
             time_s=times[chosen],
@@ -136,12 +146,10 @@ class VideoErrors:
             cameras=[view.undistorted(frames[0])[1] for view in views],
         )
 
-    def _render(
-        self, footage: _Footage, name: str, motion: Motion, at: NDArray[np.int64]
-    ) -> tuple[Image, NDArray[np.bool_]]:
-        """Return rendered pictures (F, H, W, 3) and the masks (F, H, W) of the free bodies."""
+    def _render(self, footage: _Footage, name: str, motion: Motion, at: NDArray[np.int64]) -> tuple[Image, Image]:
+        """Return rendered pictures (F, H, W, 3) and numbered masks (F, H, W) of the free bodies."""
         free = [k + 1 for k, body in enumerate(self.model.file.bodies) if body.motion == "free"]
-        pictures, masks = np.empty_like(footage.images), np.zeros(footage.images.shape[:3], bool)
+        pictures, masks = np.empty_like(footage.images), np.zeros(footage.images.shape[:3], np.uint8)
         # Repeated poses (a frozen body) are rendered once.
         poses = np.concatenate((motion.position_m[at], motion.quat_wxyz[at]), -1).reshape(len(at), -1)
         views = np.stack([camera.T_world_cam.ravel() for camera in footage.cameras])
@@ -154,7 +162,7 @@ class VideoErrors:
             rows = slice(at[frame], at[frame] + 1)
             block = next(iter(renderer.blocks(motion.position_m[rows], motion.quat_wxyz[rows])))
             same = place.ravel() == key
-            pictures[same], masks[same] = block.image[0], np.isin(block.mask[0], free)
+            pictures[same], masks[same] = block.image[0], _numbered(block.mask[0], free)
         return pictures, masks
 
     def _renderer(self, name: str, camera: Camera) -> LabelRenderer:
@@ -167,7 +175,7 @@ class VideoErrors:
 
     @staticmethod
     def _ratios(footage: _Footage, exposed: NDArray[np.float32], labels: NDArray[np.bool_]) -> tuple[Array, Array]:
-        union = labels if footage.objects is None else labels | footage.objects
+        union = labels if footage.objects is None else labels | (footage.objects > 0)
         whole, objects = np.empty(len(exposed)), np.empty(len(exposed))
         for k, picture in enumerate(exposed):
             square = np.square(picture - footage.images[k].astype(np.float32) / 255).mean(-1)
@@ -182,6 +190,14 @@ class VideoErrors:
             real = torch.from_numpy(footage.images[k].astype(np.float32) / 255)
             similar[k] = float(ssim_map(torch.from_numpy(picture), real).numpy()[footage.valid].mean())
         return similar
+
+
+def _numbered(labels: NDArray[np.integer], bodies: Sequence[int]) -> Image:
+    """Return k + 1 where the label is that of the k-th of some bodies, 0 elsewhere."""
+    numbers = np.zeros(labels.shape, np.uint8)
+    for k, label in enumerate(bodies, 1):
+        numbers[labels == label] = k
+    return numbers
 
 
 def _decibel(square: NDArray[np.float32]) -> float:

@@ -3,14 +3,16 @@
 The initial state of an episode is estimated from its warm-up with the model; the prediction uses no later data. An
 episode that begins in a hand begins at its release, as for `fit` and `diagnose`.
 Errors are averaged within an episode first, then over episodes.
+
+Where a capture has videos and no tracks of the free bodies, their poses are found in the videos (`filmed_poses.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +20,16 @@ from numpy.typing import NDArray
 from ...datasets.capture.cameras import require_metric
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode, Track
+from ...datasets.io.atomic import new_file
 from ...datasets.io.kinds import kind_of
+from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import progress
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.loader import RolloutReader
-from ...schemas import EpisodeErrors, ErrorSummary, EvalResult, InputDataError
+from ...schemas import ErrorSummary, EvalResult, InputDataError, Reference, UsageError
 from ..physics.world import World
 from ..rendering.video_view import renderable, usable_cameras
+from ..report.page_file import shows_the_same
 from ..runtime.device import resolve_device
 from ..runtime.resources import enough_memory, one_torch_thread
 from ..segments.group_parameters import group_parameters, with_known_groups
@@ -32,8 +37,11 @@ from ..segments.random_effects import with_fitted_groups
 from ..segments.release_detection import from_releases
 from ..trajectories.frame_times import episodes_at_clock
 from ..trajectories.track_noise import Noise, noise_of
-from .episode_errors import episode_errors, video_mean, within
+from .episode_errors import episode_errors, silhouette_mean, video_mean, within
+from .evaluation import EpisodeEvaluation, Evaluation
+from .filmed_poses import PoseUncertainty, filmed_poses
 from .image_errors import VideoComparison, VideoErrors
+from .page import evaluation_html, mark_of
 from .prediction import BASELINES, MODEL, STATE_FIT_EPISODES, EpisodePrediction, predict
 from .work import checked_work
 
@@ -43,28 +51,7 @@ DATASET_NOISE = Noise(1e-4, 1e-3)
 """Assumed noise of the poses of a dataset, which are exact (position [m], rotation [rad])."""
 
 
-@dataclass(frozen=True, eq=False)
-class EpisodeEvaluation:
-    """Evaluation of one episode."""
-
-    prediction: EpisodePrediction
-    """Measurements and predictions."""
-    videos: tuple[VideoComparison, ...]
-    """Comparisons with the videos, one per camera."""
-    errors: EpisodeErrors
-    """Errors of the episode."""
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """Result of `cgwm eval` with the underlying motions and frames."""
-
-    result: EvalResult
-    """Summary of the errors."""
-    episodes: tuple[EpisodeEvaluation, ...]
-    """Evaluations of the episodes."""
-
-
+@reads("model", "target")
 def evaluate(
     model: Path,
     target: Path,
@@ -72,6 +59,9 @@ def evaluate(
     warmup_s: float = 0.1,
     device: str = "auto",
     accept_units: bool = False,
+    reference: Reference = "auto",
+    page: Path | None = None,
+    overwrite: bool = False,
 ) -> EvalResult:
     """Evaluate a model on disk against a capture's tracks and frames, or against the states of a dataset.
 
@@ -83,22 +73,52 @@ def evaluate(
         warmup_s: Duration of the start of an episode that the model may use [s].
         device: Device of the renderer: auto, cpu or cuda. Rollouts of few bodies are fastest on the CPU.
         accept_units: Do not refuse units and frames of the capture that its motion contradicts.
+        reference: With what predictions begin and are compared: tracks, or poses found in the images of the videos;
+            auto takes tracks where the split has any of the free bodies, and videos otherwise.
+        page: The page to write, of a capture; None writes none.
+        overwrite: Replace what is at `page`; a page of the same model, capture and split is replaced in any case.
 
     Raises:
         InputDataError: If the target has no data to compare with, or other bodies than the model.
-        UsageError: If the split does not exist.
+        UsageError: If the split does not exist, `page` exists, or a dataset is to be compared by images or shown.
         NotConvergedError: If a rollout of the model diverges.
         NotEnoughMemoryError: If the available memory is not sufficient to render the frames.
     """
+    mark = ""
+    if page is not None:
+        mark = mark_of(page, model, target, split)
+        overwrite = overwrite or shows_the_same(page, mark)
+        refuse_output(page, "page", overwrite)
     loaded = read_model(model)
     if kind_of(target) == "dataset":
+        _refuse_images(target, reference, page)
         return evaluate_dataset(loaded, target, split, warmup_s).result
     capture = Capture.open(target, splits=(split,), accept_units=accept_units or loaded.accepts_units)
     tried = f"{loaded.visual_count} spheres, frames of the videos at their own size"
     with enough_memory(
         tried, str(resolve_device(device)), "a model of fewer spheres (cgwm fit --spheres), smaller videos"
     ):
-        return evaluate_model(loaded, capture, split, warmup_s, device).result
+        found = evaluate_model(loaded, capture, split, warmup_s, device, page is not None, reference=reference)
+    if page is None:
+        return found.result
+    with new_file(page, "page", overwrite) as path:
+        path.write_text(evaluation_html(found, capture, page, model, split, mark), encoding="utf-8")
+    return found.result.model_copy(update={"report": str(page)})
+
+
+def _refuse_images(target: Path, reference: Reference, page: Path | None) -> None:
+    if page is not None:
+        raise UsageError(
+            f"--page {page}: {target} is a dataset, which has no videos.",
+            "a page for a capture.",
+            "leave --page out; cgwm view shows rollouts.",
+        )
+    if reference == "images":
+        raise UsageError(
+            f"--reference images: {target} is a dataset, whose states are exact.",
+            "auto or tracks for a dataset.",
+            "leave --reference out.",
+        )
 
 
 def evaluate_model(
@@ -109,6 +129,7 @@ def evaluate_model(
     device: str = "auto",
     keep_frames: bool = False,
     brief: bool = False,
+    reference: Reference = "tracks",
 ) -> Evaluation:
     """Evaluate a model against the tracks of a capture, and against its frames if model and cameras allow.
 
@@ -120,23 +141,20 @@ def evaluate_model(
         device: Device of the renderer: auto, cpu or cuda.
         keep_frames: Keep the predicted and the real frames (tens of megabytes an episode).
         brief: Compute only the errors of the poses and of the baselines, without frames and fitted states.
+        reference: See :func:`evaluate`.
 
     Raises:
         See :func:`evaluate`.
     """
     check_bodies(model, capture.body_names, str(capture.root))
     world = World.from_model(model)
-    free = {body.name for body in model.file.bodies if body.motion == "free"}
-    timed, clocked = episodes_at_clock(capture, capture.episodes(split), free)
-    episodes, warnings = _usable(model, timed)
-    warnings += clocked
-    if not episodes:
-        raise InputDataError(
-            f"{capture.root}: no episode of split '{split}' can be evaluated. {' '.join(warnings)}".rstrip(),
-            "tracks/<episode>.csv with rows for every free and driven body.",
-            "add tracks, or name another split with --split.",
-        )
-    noise = _noise(model, capture, episodes)
+    uncertainty: dict[str, PoseUncertainty] | None = None
+    if _by_images(model, capture, split, reference):
+        filmed = filmed_poses(world, model, capture, split, device)
+        episodes, noise, warnings, uncertainty = filmed.episodes, filmed.noise, filmed.warnings, filmed.uncertainty
+    else:
+        episodes, warnings = _tracked(model, capture, split)
+        noise = _noise(model, capture, episodes)
     episodes, held = _released(world, episodes, noise)
     warnings += held
     cameras = {} if brief else _cameras(model, capture, [name for name, _ in episodes], warnings)
@@ -155,7 +173,37 @@ def evaluate_model(
         found = [videos.compare(prediction, name) for name in names] if videos else []
         return tuple(comparison for comparison in found if comparison is not None)
 
-    return _evaluation(predictions, compare, warnings)
+    return _evaluation(predictions, compare, warnings, uncertainty)
+
+
+def _by_images(model: Model, capture: Capture, split: str, reference: Reference) -> bool:
+    """Return whether the poses of the free bodies are to be found in the videos."""
+    _require_free(model)
+    if reference != "auto":
+        return reference == "images"
+    names = capture.episodes(split)
+    tracked = any(set(model.file.tracked) & set(capture.tracks(name)) for name in names)
+    return not tracked and any(capture.videos(name) for name in names)
+
+
+def _tracked(model: Model, capture: Capture, split: str) -> tuple[list[Episode], list[str]]:
+    """Return the episodes of a split with tracks of every moving body, and warnings.
+
+    Raises:
+        InputDataError: If there is none.
+    """
+    timed, clocked = episodes_at_clock(capture, capture.episodes(split), set(model.file.tracked))
+    episodes, warnings = _usable(model, timed)
+    if episodes:
+        return episodes, [*warnings, *clocked]
+    filmed = any(capture.videos(name) for name in capture.episodes(split))
+    raise InputDataError(
+        f"{capture.root}: no episode of split '{split}' can be evaluated. {' '.join(warnings)}".rstrip(),
+        "tracks/<episode>.csv with rows for every free and driven body.",
+        "add tracks; cgwm eval finds poses in the videos where there are none."
+        if filmed
+        else "add tracks or videos, or name another split with --split.",
+    )
 
 
 @one_torch_thread()
@@ -244,12 +292,7 @@ def _listed(names: Sequence[str]) -> str:
 def _usable(model: Model, episodes: Sequence[Episode]) -> tuple[list[Episode], list[str]]:
     """Return the episodes in which every moving body has a track, and messages on the others."""
     moving = [*model.file.tracked, *model.file.commanded]
-    if not model.file.tracked:
-        raise InputDataError(
-            f"{model.place}: none of its bodies is free, so there is no motion to predict.",
-            'a body with the motion "free".',
-            "take a model with one, or fit one.",
-        )
+    _require_free(model)
     usable, warnings = [], []
     for name, tracks in episodes:
         lacking = [body for body in moving if body not in tracks]
@@ -258,6 +301,15 @@ def _usable(model: Model, episodes: Sequence[Episode]) -> tuple[list[Episode], l
         else:
             usable.append(Episode(name, tracks))
     return usable, warnings
+
+
+def _require_free(model: Model) -> None:
+    if not model.file.tracked:
+        raise InputDataError(
+            f"{model.place}: none of its bodies is free, so there is no motion to predict.",
+            'a body with the motion "free".',
+            "take a model with one, or fit one.",
+        )
 
 
 def _noise(model: Model, capture: Capture, episodes: Sequence[Episode]) -> Noise:
@@ -318,6 +370,7 @@ def _evaluation(
     predictions: Sequence[EpisodePrediction],
     compare: Callable[[EpisodePrediction], tuple[VideoComparison, ...]],
     warnings: list[str],
+    uncertainty: Mapping[str, PoseUncertainty] | None = None,
 ) -> Evaluation:
     episodes = []
     filmed = progress(predictions, "eval: frames", len(predictions), "episode")
@@ -326,7 +379,8 @@ def _evaluation(
             warnings.append(f"episode '{prediction.episode}' is left out: no measured frame follows the warm-up.")
             continue
         videos = compare(prediction)
-        episodes.append(EpisodeEvaluation(prediction, videos, episode_errors(prediction, videos)))
+        known = None if uncertainty is None else uncertainty[prediction.episode]
+        episodes.append(EpisodeEvaluation(prediction, videos, episode_errors(prediction, videos, known)))
     if not episodes:
         raise InputDataError(
             "in none of the episodes does a measured frame follow the warm-up.",
@@ -341,19 +395,29 @@ def _evaluation(
             f"state_fitted_residual_m is that of {fitted} of {len(episodes)} episodes, evenly spread "
             f"(at most {STATE_FIT_EPISODES} are fitted)."
         )
-    return Evaluation(_result(episodes, warnings), tuple(episodes))
+    if uncertainty is not None and not any(video.true_masks for episode in episodes for video in episode.videos):
+        warnings.append("no IoU, no distances of silhouettes and centroids: the videos have no masks.")
+    reference = "tracks" if uncertainty is None else "images"
+    return Evaluation(_result(episodes, reference, warnings), tuple(episodes))
 
 
-def _result(episodes: Sequence[EpisodeEvaluation], warnings: Sequence[str]) -> EvalResult:
+def _result(
+    episodes: Sequence[EpisodeEvaluation], reference: Literal["tracks", "images"], warnings: Sequence[str]
+) -> EvalResult:
     errors = [episode.errors for episode in episodes]
     model = _figures(episodes, MODEL)
     return EvalResult(
         episodes=len(episodes),
+        reference=reference,
         translation_error_m=model["translation_error_m"],
         rotation_error_deg=model["rotation_error_deg"],
         psnr_db=model["psnr_db"],
         psnr_object_db=model["psnr_object_db"],
         ssim=model["ssim"],
+        mask_iou=model["mask_iou"],
+        centroid_error_px=model["centroid_error_px"],
+        outline_error_px=model["outline_error_px"],
+        centroid_error_m=_summary([e.centroid_error_m for e in errors], [e.centroid_final_m for e in errors]),
         state_fitted_residual_m=_summary([e.state_fitted_residual_m for e in errors]),
         state_noise_floor_m=_summary([e.state_noise_floor_m for e in errors]),
         baselines={method: _plain(_figures(episodes, method)) for method in BASELINES},
@@ -372,6 +436,9 @@ def _figures(episodes: Sequence[EpisodeEvaluation], method: str) -> dict[str, An
         "psnr_db": _summary([video_mean(e.videos, "psnr_db", method) for e in episodes]),
         "psnr_object_db": _summary([video_mean(e.videos, "psnr_object_db", method) for e in episodes]),
         "ssim": _summary([video_mean(e.videos, "ssim", method) for e in episodes]),
+        "mask_iou": _summary([silhouette_mean(e.videos, "iou", method) for e in episodes]),
+        "centroid_error_px": _summary([silhouette_mean(e.videos, "centroid_px", method) for e in episodes]),
+        "outline_error_px": _summary([silhouette_mean(e.videos, "outline_px", method) for e in episodes]),
     }
 
 

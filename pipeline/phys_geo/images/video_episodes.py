@@ -60,11 +60,12 @@ def load_video_episode(
     capture: Capture,
     name: str,
     outlines: Mapping[str, Mesh],
-    slot: Slot,
+    slot: Slot | None,
     *,
     tracks_too: bool,
     image_size: int,
     device: torch.device,
+    span_s: float = MAX_SPAN_S,
 ) -> VideoEpisode:
     """Read an episode and find its tracks.
 
@@ -74,10 +75,12 @@ def load_video_episode(
         capture: The capture.
         name: Name of the episode.
         outlines: Surfaces of the bodies, where only masks can be compared.
-        slot: Part of the checkpoint for the found poses, so that an interrupted fit does not search for them again.
+        slot: Part of the checkpoint for the found poses, so that an interrupted fit does not search for them again;
+            None for none.
         tracks_too: Use measured tracks where there are any, instead of finding them in the images.
         image_size: Longer side of the compared images [px].
         device: Device of the renderer.
+        span_s: Duration of the start of the episode that is used [s].
 
     Raises:
         InputDataError: If the episode lacks videos, masks or tracks that are needed.
@@ -88,7 +91,7 @@ def load_video_episode(
     own = {body.name: measured[body.name] for body in world.bodies if body.free and body.name in measured}
     if tracks_too and own and not capture.videos(name):
         return VideoEpisode(name=name, footage=None, loss=None, tracks=own | drives, found=None)
-    footage = _within_span(load_footage(capture, name, image_size, device))
+    footage = _within_span(load_footage(capture, name, image_size, device), span_s)
     loss = image_loss(model, footage, world.free, outlines)
     if tracks_too and own:
         return VideoEpisode(name=name, footage=footage, loss=loss, tracks=own | drives, found=None)
@@ -98,7 +101,13 @@ def load_video_episode(
             "video_masks/<camera>/<episode>, or a single free body.",
             "add masks, which are needed to distinguish the bodies.",
         )
-    found = _found_track(world, model, capture, loss, outlines, slot, drives, device)
+    stored = None if slot is None else slot.read(torch.device("cpu"))
+    if stored is not None:
+        found = stored_track(stored)
+    else:
+        found = _found_track(world, model, capture, loss, outlines, drives, device, span_s)
+        if slot is not None:
+            slot.write(track_state(found))
     return VideoEpisode(
         name=name, footage=footage, loss=loss, tracks=_tracks_of(world, footage, found) | drives, found=found
     )
@@ -110,20 +119,15 @@ def _found_track(
     capture: Capture,
     loss: ImageLoss,
     outlines: Mapping[str, Mesh],
-    slot: Slot,
     drives: Mapping[str, Track],
     device: torch.device,
+    span_s: float,
 ) -> PoseTrack:
-    """Return the poses of an episode from its checkpoint; without one, find them and write it."""
-    state = slot.read(torch.device("cpu"))
-    if state is not None:
-        return stored_track(state)
-    small = _within_span(load_footage(capture, loss.footage.episode, _coarse_size(loss), device))
+    """Find the poses of an episode in its videos."""
+    small = _within_span(load_footage(capture, loss.footage.episode, _coarse_size(loss), device), span_s)
     coarse = image_loss(coarse_model(model), small, world.free, outlines)
     position, quat = kinematic_poses(world, drives, loss.footage.times_s)
-    found = PoseTracker(coarse, loss, position, quat).run()
-    slot.write(track_state(found))
-    return found
+    return PoseTracker(coarse, loss, position, quat).run()
 
 
 def _coarse_size(loss: ImageLoss) -> int:
@@ -193,10 +197,10 @@ def kinematic_poses(world: World, drives: Mapping[str, Track], times_s: NDArray[
     return position, quat
 
 
-def _within_span(footage: Footage) -> Footage:
-    """Return the footage within the duration of the fit, evenly thinned to at most `MAX_INSTANTS`."""
+def _within_span(footage: Footage, span_s: float) -> Footage:
+    """Return the footage of the first `span_s` seconds, evenly thinned to at most `MAX_INSTANTS`."""
     times = footage.times_s
-    keep = np.flatnonzero(times <= times[0] + MAX_SPAN_S + 1e-9)
+    keep = np.flatnonzero(times <= times[0] + span_s + 1e-9)
     if len(keep) > MAX_INSTANTS:
         keep = keep[np.linspace(0, len(keep) - 1, MAX_INSTANTS).round().astype(int)]
     return Footage(footage.episode, footage.videos, times[keep], footage.frame_at[:, keep])

@@ -10,8 +10,9 @@ import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.tracks import Track, write_tracks
 from cgwm.datasets.models.model import write_model
+from cgwm.pipeline.evaluate.evaluation import Evaluation
 from cgwm.pipeline.evaluate.prediction import Motion
-from cgwm.pipeline.evaluate.stage import Evaluation, evaluate, evaluate_model
+from cgwm.pipeline.evaluate.stage import evaluate, evaluate_model
 from cgwm.pipeline.physics import State, World
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.trajectories.state_uncertainty import covariance_root

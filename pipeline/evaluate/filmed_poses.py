@@ -1,0 +1,146 @@
+"""Poses of held-out episodes that were filmed but not tracked: found in their videos, as a fit to videos finds them.
+
+They serve as the measurement with which predictions begin and are compared. The physics of the model has no part in
+them, but its shape, its colours and the cameras have: an error of these is in the prediction and in the reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...datasets.capture.cameras import require_metric
+from ...datasets.capture.capture import Capture
+from ...datasets.capture.tracks import Episode
+from ...datasets.models.model import Model
+from ...schemas import InputDataError, NotConvergedError, PhysConfig
+from ..phys_geo.images.pose_tracking import pose_noise
+from ..phys_geo.images.silhouettes import body_outlines
+from ..phys_geo.images.video_episodes import VideoEpisode, load_video_episode, track_warnings
+from ..physics.world import World
+from ..runtime.device import resolve_device
+from ..trajectories.track_noise import Noise
+from .prediction import EpisodePrediction
+
+Array = NDArray[np.float64]
+
+IMAGE_SIZE = PhysConfig().image_size
+"""Longer side to which frames are reduced [px], as for a fit to videos."""
+NORMAL_95 = 1.959964
+"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseUncertainty:
+    """Uncertainty of the poses of one episode, from the scatter of the pixels."""
+
+    times_s: Array
+    """Times of the poses [s], shape (F,)."""
+    covariance: Array
+    """Covariances of shift [m2] and rotation [rad2] of the nf free bodies, shape (F, 6 nf, 6 nf)."""
+
+    def intervals(self, prediction: EpisodePrediction, moved: float, turned: float) -> tuple[Interval, Interval]:
+        """Return 95 % intervals of the mean errors after the warm-up, [m] and [deg].
+
+        Errors of shape, colour and camera last as long as the episode, so that no averaging over frames lowers them:
+        the half width is that of one frame, along the error.
+
+        Args:
+            prediction: The prediction.
+            moved: Its mean error of translation [m].
+            turned: Its mean error of rotation [deg].
+        """
+        after = np.flatnonzero(prediction.seen.any(1) & ~prediction.warmup)
+        rows = np.abs(self.times_s[:, None] - prediction.time_s[after]).argmin(0)
+        shift = (prediction.predicted()[0] - prediction.position_m)[after]
+        length = np.linalg.norm(shift, axis=-1, keepdims=True)
+        along = np.where(length > 0, shift / np.where(length > 0, length, 1.0), 3**-0.5)
+        spread = []
+        for body in range(shift.shape[1]):
+            block = self.covariance[rows][:, 6 * body : 6 * body + 6, 6 * body : 6 * body + 6]
+            place = np.einsum("fi,fij,fj->f", along[:, body], block[:, :3, :3], along[:, body])
+            turn = np.trace(block[:, 3:, 3:], axis1=1, axis2=2) / 3
+            spread.append(np.sqrt(np.maximum([place, turn], 0.0)).mean(1))
+        reach = NORMAL_95 * np.mean(spread, axis=0)
+        return _around(moved, float(reach[0])), _around(turned, float(np.degrees(reach[1])))
+
+
+Interval = tuple[float, float]
+
+
+def _around(value: float, reach: float) -> Interval:
+    return max(value - reach, 0.0), value + reach
+
+
+@dataclass(frozen=True, eq=False)
+class FilmedPoses:
+    """Poses found in the videos of some episodes."""
+
+    episodes: list[Episode]
+    """Tracks of the episodes in whose videos the bodies were found."""
+    noise: Noise
+    """Standard deviations of a pose by axis (position [m], rotation [rad])."""
+    uncertainty: dict[str, PoseUncertainty]
+    """By episode."""
+    warnings: list[str]
+    """Which episodes are left out, and what is doubtful."""
+
+
+def filmed_poses(world: World, model: Model, capture: Capture, split: str, device: str) -> FilmedPoses:
+    """Find the poses of the free bodies in the videos of a split.
+
+    Args:
+        world: The model's world.
+        model: A model whose bodies can be drawn: with visual spheres and a scene, or with shapes, and masks.
+        capture: The capture with calibrated, metric cameras.
+        split: The episodes.
+        device: Device of the renderer: auto, cpu or cuda.
+
+    Raises:
+        InputDataError: If the videos cannot be used, or the bodies are found in none of them.
+    """
+    if capture.cameras is not None:
+        require_metric(capture.cameras)
+    names = [name for name in capture.episodes(split) if capture.videos(name)]
+    if not names:
+        raise InputDataError(
+            f"{capture.root}: no episode of split '{split}' has a video.",
+            "videos/<camera>/<episode>.mp4, or a directory of frames.",
+            "add videos, or name another split with --split.",
+        )
+    outlines, notes = body_outlines(model, capture, names)
+    found: list[VideoEpisode] = []
+    for name in names:
+        try:
+            found.append(
+                load_video_episode(
+                    world, model, capture, name, outlines, None, tracks_too=False, image_size=IMAGE_SIZE,
+                    device=resolve_device(device), span_s=np.inf,
+                )
+            )  # fmt: skip
+        except NotConvergedError as error:
+            notes.append(f"episode '{name}' is left out: {error.found}")
+    if not found:
+        raise InputDataError(
+            f"{capture.root}: the free bodies are found in no video of split '{split}'. {' '.join(notes)}",
+            "videos that show the bodies of the model, from cameras that are calibrated in the capture's frame.",
+            "add video_masks/ (cgwm mask --empty), or check that the cameras did not move since they were calibrated.",
+        )
+    tracks = [episode.found for episode in found if episode.found is not None]
+    uncertainty = {
+        episode.name: PoseUncertainty(
+            episode.footage.times_s[episode.found.found.numpy()],
+            episode.found.covariance[episode.found.found].numpy(),
+        )
+        for episode in found
+        if episode.found is not None and episode.footage is not None
+    }
+    episodes = [Episode(episode.name, episode.tracks) for episode in found]
+    return FilmedPoses(episodes, pose_noise(tracks), uncertainty, [*notes, *_doubts(found)])
+
+
+def _doubts(episodes: Sequence[VideoEpisode]) -> list[str]:
+    return [f"poses of {text}" for text in track_warnings(episodes)]

@@ -1,0 +1,171 @@
+"""Distance of predicted from filmed bodies by the centroids of their masks alone: neither poses nor colours are used.
+
+The centroid of a silhouette is not the image of a point of the body, but the centroids of the mask and of the predicted
+silhouette are made in the same way: each set of centroids is triangulated from the calibrated cameras, and the two
+points are compared. What the cameras disagree about says how exact the centroids are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...datasets.capture.cameras import Camera
+
+Array = NDArray[np.float64]
+
+SAME_INSTANT_S = 1e-6
+"""Maximum difference of the times of frames at one instant [s]."""
+MIN_CAMERAS = 2
+NORMAL_95 = 1.959964
+"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
+LEAST_STD_PX = 0.25
+"""Minimum standard deviation of a centroid [px]: the cameras' agreement in few frames may be by chance, and two cameras
+say nothing about errors along the line between them."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sighting:
+    """What one camera shows of one episode: centroids of the nf free bodies in F frames."""
+
+    time_s: Array
+    """Times of the frames [s], shape (F,)."""
+    cameras: Sequence[Camera]
+    """Camera of each frame, without distortion."""
+    real: Array
+    """Centroids (x, y) of the masks [px], NaN where unknown, shape (F, nf, 2)."""
+    predicted: Array
+    """Centroids of the predicted silhouettes, the same."""
+
+
+@dataclass(frozen=True)
+class CentroidDistance:
+    """Distance between predicted and filmed centroids, over the instants at which two cameras or more show both."""
+
+    mean_m: float
+    """Mean distance [m]."""
+    final_m: float
+    """Distance at the last of these instants [m]."""
+    interval_95_m: tuple[float, float]
+    """95 % interval of the mean [m], for errors of the centroids that last as long as the episode."""
+    instants: int
+
+
+def centroid_distance(sightings: Sequence[Sighting]) -> CentroidDistance | None:
+    """Return the distance by triangulated centroids; None if no instant is shown by two cameras."""
+    pairs = [pair for k, rows in enumerate(_instants(sightings)) for pair in _both(sightings, k, rows)]
+    if not pairs:
+        return None
+    squares = sum(pair.square for pair in pairs)
+    freedoms = sum(pair.freedoms for pair in pairs)
+    std_px = max(float(np.sqrt(squares / freedoms)), LEAST_STD_PX)
+    distances = np.array([float(np.linalg.norm(pair.shift_m)) for pair in pairs])
+    reach = NORMAL_95 * std_px * float(np.mean([_std_along(pair) for pair in pairs]))
+    mean = float(distances.mean())
+    interval = (max(mean - reach, 0.0), mean + reach)
+    return CentroidDistance(mean, float(distances[-1]), interval, len({pair.instant for pair in pairs}))
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Predicted and filmed centroid of one body at one instant."""
+
+    instant: int
+    shift_m: Array
+    """From the filmed to the predicted point [m], shape (3,)."""
+    covariance: Array
+    """Of the shift, for a standard deviation of 1 px of either coordinate of a centroid, shape (3, 3)."""
+    square: float
+    """Sum of squares of what the cameras disagree about [px2], for predicted minus filmed centroids."""
+    freedoms: int
+    """Number of coordinates above those of a point."""
+
+
+def _std_along(pair: _Pair) -> float:
+    """Return the standard deviation along the shift [m for 1 px]; of the mean direction where there is no shift."""
+    length = float(np.linalg.norm(pair.shift_m))
+    if length < 1e-9:
+        return float(np.sqrt(np.trace(pair.covariance) / 3))
+    along = pair.shift_m / length
+    return float(np.sqrt(along @ pair.covariance @ along))
+
+
+def _instants(sightings: Sequence[Sighting]) -> list[list[tuple[int, int]]]:
+    """Return (camera, frame) of the frames of each instant that several cameras show."""
+    frames = [(float(t), c, k) for c, seen in enumerate(sightings) for k, t in enumerate(seen.time_s)]
+    groups: list[list[tuple[float, int, int]]] = []
+    for frame in sorted(frames):
+        if groups and frame[0] - groups[-1][0][0] <= SAME_INSTANT_S:
+            groups[-1].append(frame)
+        else:
+            groups.append([frame])
+    return [[(c, k) for _, c, k in group] for group in groups if len(group) >= MIN_CAMERAS]
+
+
+def _both(sightings: Sequence[Sighting], instant: int, rows: list[tuple[int, int]]) -> list[_Pair]:
+    """Return the pair of each body that two cameras or more show at an instant, by mask and by prediction."""
+    found = []
+    for body in range(sightings[0].real.shape[1]):
+        seen = [
+            (sightings[c].cameras[k], sightings[c].real[k, body], sightings[c].predicted[k, body])
+            for c, k in rows
+            if np.isfinite(sightings[c].real[k, body]).all() and np.isfinite(sightings[c].predicted[k, body]).all()
+        ]
+        if len(seen) >= MIN_CAMERAS:
+            found.append(_pair(instant, seen))
+    return found
+
+
+def _pair(instant: int, seen: Sequence[tuple[Camera, Array, Array]]) -> _Pair:
+    cameras = [camera for camera, _, _ in seen]
+    points, residuals = [], []
+    for kind in (1, 2):
+        pixels = np.array([one[kind] for one in seen])
+        point = triangulated(cameras, pixels)
+        points.append(point)
+        residuals.append(np.concatenate([_projected(c, point)[0] for c in cameras]) - pixels.ravel())
+    slope = np.concatenate([_projected(camera, points[0])[1] for camera in cameras])
+    covariance = np.linalg.inv(slope.T @ slope)
+    apart = residuals[1] - residuals[0]
+    return _Pair(instant, points[1] - points[0], covariance, float(apart @ apart), 2 * len(cameras) - 3)
+
+
+def triangulated(cameras: Sequence[Camera], pixels: Array) -> Array:
+    """Return the point whose images are nearest to pixels, by Gauss-Newton from the midpoint of the rays.
+
+    Args:
+        cameras: Cameras without distortion.
+        pixels: (x, y) in each of them, shape (cameras, 2).
+
+    Returns:
+        The point [m], world, shape (3,).
+    """
+    point = _midpoint(cameras, pixels)
+    for _ in range(5):
+        found = [_projected(camera, point) for camera in cameras]
+        residual = np.concatenate([place for place, _ in found]) - pixels.ravel()
+        step, *_ = np.linalg.lstsq(np.concatenate([slope for _, slope in found]), residual, rcond=None)
+        point = point - step
+    return point
+
+
+def _midpoint(cameras: Sequence[Camera], pixels: Array) -> Array:
+    """Return the point with the least sum of squared distances from the rays through pixels."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for camera, pixel in zip(cameras, pixels, strict=True):
+        ray = camera.T_world_cam[:3, :3] @ np.linalg.solve(camera.K, [*pixel, 1.0])
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        normal += across
+        right += across @ camera.T_world_cam[:3, 3]
+    return np.linalg.solve(normal, right)
+
+
+def _projected(camera: Camera, point: Array) -> tuple[Array, Array]:
+    """Return the image (2,) [px] of a point and its derivative (2, 3) [px/m]."""
+    rotation = camera.T_cam_world[:3, :3]
+    x, y, z = camera.K @ (rotation @ point + camera.T_cam_world[:3, 3])
+    slope = np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]]) @ camera.K @ rotation
+    return np.array([x / z, y / z]), slope
