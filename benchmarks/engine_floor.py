@@ -5,6 +5,7 @@
     python benchmarks/engine_floor.py run --stage report --workers 2
     python benchmarks/engine_floor.py table
     python benchmarks/engine_floor.py friction
+    python benchmarks/engine_floor.py impacts
 
 Nothing is fitted, filmed or rendered: what an open-loop prediction from the true state misses by is what the law cannot
 express, or what nobody can predict. Friction is the engine's own. Natural time and damping ratio have a counterpart in
@@ -28,8 +29,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cgwm.datasets.synthetic.dynamics import GRAVITY, rest_pose
+from cgwm.datasets.synthetic.dynamics import (
+    GRAVITY,
+    STEPS_PER_S,
+    Motion,
+    lowest,
+    matrix_from_quat,
+    quat_from_matrix,
+    rest_pose,
+)
+from cgwm.datasets.synthetic.objects import SolidObject
 from cgwm.schemas import NotConvergedError
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from store import Store
 from tabletop.capture import TASKS, Task, plan_capture
 from tabletop.engines import ENGINES, JUDGES, refusal
@@ -43,6 +55,8 @@ TIMES_S = (0.002, 0.003, 0.0045, 0.007, 0.011, 0.017)
 RATIOS = (0.15, 0.25, 0.4, 0.6, 0.9)
 GRID = tuple(f"{time:g} {ratio:g}" for time, ratio in itertools.product(TIMES_S, RATIOS))
 DIRECTIONS_DEG = (0.0, 22.5, 45.0, 67.5, 90.0)
+_APART_M = 1e-4
+"""Height of the lowest corner from which on a body has left the ground."""
 UNIT_MM, UNIT_DEG = 10.0, 10.0
 """Errors count in these units where one number must be found."""
 
@@ -181,6 +195,55 @@ def friction_by_direction(engine: str) -> list[float]:
     return result
 
 
+def friction_of_impacts(engine: str, material: str) -> list[float]:
+    """Return the friction that a box feels in an impact on a face or a corner while it slides, over the ground's.
+
+    Coulomb's law gives a horizontal impulse of friction times the vertical one, 1 here, as long as all that touches
+    slides.
+
+    Args:
+        engine: One of `ENGINES`.
+        material: One of `MATERIALS`.
+    """
+    item, contact, speed, fall = load_item("box"), MATERIALS[material], 4.0, 1.4
+    made = ENGINES[engine].make(item.solid, contact, False)
+    result = []
+    flat = matrix_from_quat(rest_pose(item.solid, item.down, 0.3, 0, 0)[3:7])
+    for angle, tilt in itertools.product(np.radians(DIRECTIONS_DEG), ((0, 0, 0), (0.4, 0.3, 0), (0.3, -0.4, 0))):
+        quat = quat_from_matrix(Rotation.from_rotvec(tilt).as_matrix() @ flat)
+        pose = np.array([0, 0, 0, *quat])
+        pose[2] = lowest(item.solid, pose[3:7]) + 0.002
+        start = np.array([speed * np.cos(angle), speed * np.sin(angle), -fall, 0, 0, 0])
+        motion = made.simulate(pose, start, 0.0, 0.06)
+        heights = np.array([qpos[2] - lowest(item.solid, qpos[3:7]) for qpos in motion.qpos])
+        touched = int(np.argmax(heights < _APART_M))
+        above = np.flatnonzero(heights[touched:] > _APART_M)
+        left = touched + int(above[0]) if len(above) else len(heights) - 2
+        change = _velocity(item.solid, motion, left + 1) - _velocity(item.solid, motion, 0)
+        change[2] += GRAVITY * (left + 1) / STEPS_PER_S
+        result.append(float(np.hypot(change[0], change[1]) / change[2] / contact.friction))
+    return result
+
+
+def _velocity(solid: SolidObject, motion: Motion, row: int) -> NDArray[np.float64]:
+    """Return the velocity of the centre of mass [m/s]."""
+    turn = matrix_from_quat(motion.qpos[row, 3:7])
+    return motion.qvel[row, :3] + turn @ np.cross(motion.qvel[row, 3:6], solid.com)
+
+
+def impact_table() -> str:
+    """Return the friction of impacts by engine and ground in Markdown."""
+    lines = ["| engine | " + " | ".join(MATERIALS) + " |", "| --- |" + " --- |" * len(MATERIALS)]
+    for name in JUDGES:
+        reason = refusal(name, load_item("box").solid)
+        cells = [reason] * len(MATERIALS)
+        if reason is None:
+            found = [np.percentile(friction_of_impacts(name, one), (50, 0, 100)) for one in MATERIALS]
+            cells = [f"{middle:.2f} ({low:.2f} to {high:.2f})" for middle, low, high in found]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join((*lines, "Median (least to largest) over directions and orientations; 1 by Coulomb's law."))
+
+
 def friction_table() -> str:
     """Return the friction of every engine by direction in Markdown."""
     lines = ["| engine | " + " | ".join(f"{angle:g} deg" for angle in DIRECTIONS_DEG) + " |"]
@@ -195,7 +258,7 @@ def friction_table() -> str:
 def main() -> int:
     """Measure what is missing, or print the table of what is stored."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "table", "friction"))
+    parser.add_argument("what", choices=("run", "table", "friction", "impacts"))
     parser.add_argument("--stage", choices=tuple(FIRST_SEED), default="dev")
     parser.add_argument("--engines", default=",".join(JUDGES))
     parser.add_argument("--captures", type=int, default=8, help="of every engine and task")
@@ -207,8 +270,8 @@ def main() -> int:
     unknown = [name for name in given.engines.split(",") if name not in ENGINES]
     if unknown:
         parser.error(f"--engines: {unknown[0]!r} is none of {', '.join(ENGINES)}")
-    if given.what == "friction":
-        print(friction_table())
+    if given.what in ("friction", "impacts"):
+        print(friction_table() if given.what == "friction" else impact_table())
         return 0
     store = Store("engine_floor", given.store, given.any_commit)
     if given.what == "table":

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...datasets.capture.cameras import require_metric
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode
+from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import Model
 from ...schemas import InputDataError, NotConvergedError, PhysConfig
 from ..phys_geo.images.pose_tracking import pose_noise
@@ -102,6 +103,7 @@ def filmed_poses(world: World, model: Model, capture: Capture, split: str, devic
     Raises:
         InputDataError: If the videos cannot be used, or the bodies are found in none of them.
     """
+    refuse_joints(model.file.articulations, str(capture.root), "an evaluation by images")
     if capture.cameras is not None:
         require_metric(capture.cameras)
     names = [name for name in capture.episodes(split) if capture.videos(name)]

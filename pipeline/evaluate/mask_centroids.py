@@ -128,7 +128,7 @@ def _pair(instant: int, seen: Sequence[tuple[Camera, Array, Array]]) -> _Pair:
         points.append(point)
         residuals.append(np.concatenate([_projected(c, point)[0] for c in cameras]) - pixels.ravel())
     slope = np.concatenate([_projected(camera, points[0])[1] for camera in cameras])
-    covariance = np.linalg.inv(slope.T @ slope)
+    covariance = np.asarray(np.linalg.inv(slope.T @ slope), np.float64)
     apart = residuals[1] - residuals[0]
     return _Pair(instant, points[1] - points[0], covariance, float(apart @ apart), 2 * len(cameras) - 3)
 
@@ -160,7 +160,7 @@ def _midpoint(cameras: Sequence[Camera], pixels: Array) -> Array:
         across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         normal += across
         right += across @ camera.T_world_cam[:3, 3]
-    return np.linalg.solve(normal, right)
+    return np.asarray(np.linalg.solve(normal, right), np.float64)
 
 
 def _projected(camera: Camera, point: Array) -> tuple[Array, Array]:

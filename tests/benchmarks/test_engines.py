@@ -64,6 +64,16 @@ def test_friction_is_a_cone_but_for_the_two_engines_that_say_otherwise(engines: 
             assert engine_floor.friction_by_direction(name)[2] == pytest.approx(factor * given, rel=0.03)
 
 
+def test_impacts_slide_by_coulombs_law_but_for_the_two_engines_that_say_otherwise(engines: ModuleType) -> None:
+    """Rapier bounds the friction of an impact by less than the whole normal impulse, DART by more than its friction."""
+    import engine_floor
+
+    ranges = {"mujoco": (0.9, 1.01), "drake": (0.97, 1.01), "dart": (1.1, 1.42), "rapier": (0.3, 0.45)}
+    for name, (low, high) in ranges.items():
+        if engines.engines.refusal(name, BOX) is None:
+            assert low < np.median(engine_floor.friction_of_impacts(name, "wood")) < high
+
+
 def test_the_centre_of_mass_flies_along_its_parabola(make) -> None:
     """Up to the first order in the step, g dt t / 2, by which semi-implicit steps fall lower."""
     velocity, omega = np.array([0.5, 0.2, 1.0]), np.array([3.0, -4.0, 5.0])
