@@ -243,6 +243,7 @@ CASES: dict[str, Callable[[Path], Command]] = {
     "control --overwrite": _replacing(_control, "--draws", "2"),
     "compare": _page("compare", "--out"),
     "diagnose": _page("diagnose", "--page"),
+    "eval": _page("eval", "--page"),
 }
 
 
