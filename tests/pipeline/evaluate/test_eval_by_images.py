@@ -3,13 +3,17 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from cgwm.datasets.models.model import write_model
+from cgwm.pipeline.evaluate.filmed_poses import SHARED_PX, PoseUncertainty, shared_covariance
+from cgwm.pipeline.evaluate.prediction import EpisodePrediction, Motion
 from cgwm.pipeline.evaluate.stage import evaluate
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseQuality, PoseTrack, PoseTracker
+from cgwm.pipeline.phys_geo.images.video_frames import Footage, Video
 from cgwm.schemas import EvalResult, InputDataError, NotConvergedError, UsageError
-from helpers.thrown_cube import RATE_HZ, VIDEO_HZ, add_video, thrown, truth, with_friction, write_capture
+from helpers.thrown_cube import RATE_HZ, VIDEO_HZ, add_video, camera, thrown, truth, with_friction, write_capture
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STD_M, STD_RAD = 2e-4, 2e-3
@@ -65,14 +69,38 @@ def test_a_wrong_friction_is_seen_without_tracks(folder: Path, right: EvalResult
     assert left.mask_iou[0] is not None and left.mask_iou[-1] is not None and left.mask_iou[0] > left.mask_iou[-1]
 
 
-def test_intervals_are_of_one_frame_along_the_error(right: EvalResult) -> None:
-    episode = right.per_episode[0]
-    assert episode.translation_interval_95_m is not None and episode.rotation_interval_95_deg is not None
-    high = episode.translation_interval_95_m[1]
-    assert high - episode.translation_error_m == pytest.approx(1.96 * STD_M, rel=1e-3)
-    assert episode.rotation_error_deg is not None
-    turned = episode.rotation_interval_95_deg[1] - episode.rotation_error_deg
-    assert turned == pytest.approx(math.degrees(1.96 * STD_RAD), rel=1e-3)
+def test_intervals_are_of_one_frame_along_the_error() -> None:
+    """The error is along x: its standard deviation counts, and that of a turn about the mean axis."""
+    times, motion = np.arange(3) / 30.0, np.zeros((3, 1, 3))
+    still = np.tile([1.0, 0, 0, 0], (3, 1, 1))
+    ones = np.ones((3, 1), bool)
+    prediction = EpisodePrediction(
+        episode="000", bodies=("cube",), free=(0,), time_s=times, warmup=times < 0.01, position_m=motion,
+        quat_wxyz=still, seen=ones, turned=ones, grid_s=times, rows=np.arange(3),
+        motions={"model": Motion(motion + np.array([0.01, 0, 0]), still)}, noise_floor_m=0.0, state_fitted_m=None,
+    )  # fmt: skip
+    covariance = np.diag(np.square([0.001, 9, 9, 0.01, 0.02, 0.02]))
+    known = PoseUncertainty(times, np.tile(covariance, (3, 1, 1)))
+    moved, turned = known.intervals(prediction, 0.01, 5.0)
+    assert moved == pytest.approx((0.01 - 0.00196, 0.01 + 0.00196), abs=1e-6)
+    assert turned[1] - 5.0 == pytest.approx(math.degrees(1.96 * math.sqrt(3e-4)), rel=1e-4)
+
+
+def test_what_all_frames_share_is_least_across_the_view_and_largest_along_it() -> None:
+    frames = torch.zeros(1, 72, 96, 3)
+    view = torch.tensor(camera().T_cam_world)[None]
+    video = Video(
+        camera="left", times_s=np.zeros(1), frames=frames, covers=None, K=torch.tensor(camera().K), viewmats=view
+    )
+    place, radius, focal = np.zeros(3), 0.04, 90.0
+    away = float(np.linalg.norm(camera().center - place))
+    covariance = shared_covariance(Footage.of("000", (video,)), 0, place, radius)
+    std = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3]))
+    assert std[0] == pytest.approx(SHARED_PX * away / focal, rel=0.05)
+    assert std[2] == pytest.approx(SHARED_PX * away**2 / (focal * radius), rel=0.05)
+    assert np.sqrt(covariance[3, 3]) == pytest.approx(SHARED_PX * away / (focal * radius), rel=0.05)
+    two = shared_covariance(Footage.of("000", (video, video)), 0, place, radius)
+    assert two == pytest.approx(covariance / 2)
 
 
 def test_the_page_shows_figures_and_frames(folder: Path, right: EvalResult) -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from cgwm.datasets.capture.cameras import Camera
-from cgwm.pipeline.evaluate.mask_centroids import LEAST_STD_PX, Sighting, centroid_distance, triangulated
+from cgwm.pipeline.evaluate.mask_centroids import LEAST_STD, Sighting, centroid_distance, triangulated
 from cgwm.pipeline.evaluate.silhouette_errors import SilhouetteErrors, silhouette_errors
 
 SIDE = 10
@@ -92,15 +92,15 @@ def test_triangulated_points_are_exact() -> None:
 def test_the_distance_and_its_interval() -> None:
     rng = np.random.default_rng(1)
     real = 0.05 * rng.standard_normal((30, 3))
-    shift = np.array([0.004, -0.002, 0.003])
+    shift = np.array([0.04, -0.02, 0.03])
     length = float(np.linalg.norm(shift))
     quiet = centroid_distance(sightings(real, real + shift, np.zeros((2, 30, 2))))
     assert quiet is not None and quiet.instants == 30
     assert quiet.mean_m == pytest.approx(length, abs=1e-12) == quiet.final_m
     width = quiet.interval_95_m[1] - quiet.interval_95_m[0]
-    loud = centroid_distance(sightings(real, real + shift, 1.0 * rng.standard_normal((2, 30, 2))))
+    loud = centroid_distance(sightings(real, real + shift, 2.0 * rng.standard_normal((2, 30, 2))))
     assert loud is not None
-    assert (loud.interval_95_m[1] - loud.mean_m) / (width / 2) == pytest.approx(1.0 / LEAST_STD_PX, rel=0.4)
+    assert (loud.interval_95_m[1] - loud.mean_m) / (width / 2) == pytest.approx(2.0 / (LEAST_STD * 320), rel=0.4)
     assert loud.interval_95_m[0] <= length <= loud.interval_95_m[1]
 
 
