@@ -129,7 +129,7 @@ def filmed_poses(world: World, model: Model, capture: Capture, split: str, devic
                 )
             )  # fmt: skip
         except NotConvergedError as error:
-            notes.append(f"episode '{name}' is left out: {error.found}")
+            notes.append(f"episode '{name}' is left out: {error.found.removeprefix(f'{name}: ')}")
     if not found:
         raise InputDataError(
             f"{capture.root}: the free bodies are found in no video of split '{split}'. {' '.join(notes)}",
