@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ...schemas import InputDataError
+from .quaternions import turns
 from .tracks import Track
 
 MOST_TURN_RAD = 0.8 * np.pi
@@ -35,10 +35,9 @@ def require_told_spin(path: Path, body: str, track: Track) -> None:
     """
     if track.quat_wxyz is None or len(track) < STEPS_IN_A_ROW + 1:
         return
-    pose, step = Rotation.from_quat(track.quat_wxyz, scalar_first=True), np.diff(track.time_s)
-    turns = (pose[:-1].inv() * pose[1:]).as_rotvec()
-    turn = np.linalg.norm(turns, axis=1)
-    axes = turns / np.maximum(turn, 1e-12)[:, None]
+    step, between = np.diff(track.time_s), turns(track.quat_wxyz[:-1], track.quat_wxyz[1:])
+    turn = np.linalg.norm(between, axis=1)
+    axes = between / np.maximum(turn, 1e-12)[:, None]
     far = (turn > MOST_TURN_RAD) & (step <= GAP * np.median(step))
     pairs = far[:-1] & far[1:] & (np.abs((axes[:-1] * axes[1:]).sum(1)) > ALIGNED)
     rows = np.lib.stride_tricks.sliding_window_view(pairs, STEPS_IN_A_ROW - 1).all(1)

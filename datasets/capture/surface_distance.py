@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ...schemas.surfaces import Surface
+from .quaternions import matrices
 
 Array = NDArray[np.float64]
 
@@ -24,8 +24,8 @@ def surface_distance(surfaces: Sequence[Surface], position_m: Array) -> Array:
     """
     found = np.full(len(position_m), np.inf)
     for surface in surfaces:
-        turn = Rotation.from_quat(surface.pose.quat_wxyz, scalar_first=True)
-        local = turn.inv().apply(position_m - np.asarray(surface.pose.position_m)) if len(position_m) else position_m
+        turn = matrices(np.asarray(surface.pose.quat_wxyz))
+        local = (position_m - np.asarray(surface.pose.position_m)) @ turn
         found = np.minimum(found, _distance(surface, local))
     return found
 

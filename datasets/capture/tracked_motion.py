@@ -6,14 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.transform import Rotation
 
 from ...schemas import Body, InputDataError
 from ..shapes.meshes import read_mesh
 from ..shapes.ply import read_splats
 from .folder import CaptureFolder
 from .motion_windows import MotionWindows, motion_windows
+from .quaternions import matrices
 from .tracks import Track
 from .unit_mistakes import Order
 
@@ -75,17 +74,17 @@ class TrackedMotion:
             return np.full(len(self.track), float((self.outline.points @ normal - self.outline.radii).min()))
         step = max(1, len(quat) * len(self.outline.points) // MOST_PRODUCTS)
         some = np.unique(np.append(np.arange(0, len(quat), step), len(quat) - 1))
-        down = rotations(quat[some], order).inv().apply(normal)
+        down = normal @ _matrices(quat[some], order)
         found = (down @ self.outline.points.T - self.outline.radii).min(axis=1)
         return np.interp(np.arange(len(quat)), some, found)
 
 
-def rotations(quat_wxyz: Array, order: Order) -> Rotation:
-    """Return rotations, body to world, from the columns of a track (T, 4) under an assumption about their order."""
+def _matrices(quat_wxyz: Array, order: Order) -> Array:
+    """Return rotation matrices (T, 3, 3), body to world, of a track's columns (T, 4) in an assumed order."""
     if order == "xyzw":
-        return Rotation.from_quat(quat_wxyz)
-    turn = Rotation.from_quat(quat_wxyz, scalar_first=True)
-    return turn.inv() if order == "inverse" else turn
+        return matrices(np.roll(quat_wxyz, 1, axis=1))
+    turn = matrices(quat_wxyz)
+    return turn.swapaxes(1, 2) if order == "inverse" else turn
 
 
 def tracked_motions(capture: CaptureFolder) -> list[TrackedMotion]:
@@ -166,6 +165,8 @@ def _outline_in_file(capture: CaptureFolder, body: Body, is_mesh: bool) -> Outli
 
 
 def _hull(points: Array) -> Array:
+    from scipy.spatial import ConvexHull, QhullError  # dear to import, and seldom needed
+
     try:
         return points[ConvexHull(points).vertices]
     except (QhullError, ValueError):

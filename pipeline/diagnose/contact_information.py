@@ -25,7 +25,7 @@ from ..physics.observation_model import as_measured, true_times
 from ..physics.parameters import Parameter
 from ..physics.rollout import Rollout
 from ..physics.world import State, World
-from ..segments.candidates import Variant, base_values, with_variants
+from ..segments.candidates import Together, Variant, base_values, with_variants
 from ..segments.impact_fit import ImpactBase
 from ..segments.impact_velocities import measured_impacts
 from ..segments.prepare import Prepared
@@ -68,37 +68,57 @@ class Channel:
     episodes: Array
     """Information of each episode of the data, (E, P, P): tests ask that held-out episodes are predicted."""
 
-    def noncentrality(
-        self, information: Array, sizes: Array, variant: int, beside: Sequence[int] | None = None
-    ) -> Array:
+    def reduced(self, information: Array) -> Reduced:
+        """Return the candidates' part of information (M, P, P) with the nuisance parameters eliminated."""
+        base = self.base
+        weak = np.diagonal(information, axis1=1, axis2=2) * WEAK_SHARE + WEAK_SHARE
+        inner = information[:, :base, :base] + (weak[:, :base] + self.prior)[..., None] * np.eye(base)
+        mixed = information[:, :base, base:]
+        left = information[:, base:, base:] - mixed.swapaxes(1, 2) @ np.linalg.solve(inner, mixed)
+        return Reduced(left=left, weak=weak[:, base:])
+
+    def noncentrality(self, reduced: Reduced, sizes: Array, variant: int, beside: Sequence[int] | None = None) -> Array:
         """Return the expected fall of chi2 (M,) by a missing effect of given sizes, averaged over its parameters.
 
         Args:
-            information: Information of data and motions together, shape (M, P, P).
+            reduced: Of the information of data and motions together.
             sizes: Of the effect's parameters, one of which it has at a time, shape (k,).
             variant: Place of the effect.
             beside: Places of others, one of which is fitted in its stead and may imitate it: the smallest fall counts,
                 infinite without any; None for no other one.
         """
+        own = self._places(variant)
+        alone = reduced.left[:, own][..., own]
         if beside is None:
-            return self._left(information, sizes, variant, np.empty((1, 0), dtype=np.int64)).min(1)
-        least = np.full(len(information), np.inf)
+            return _mean_fall(alone, sizes)
+        least = np.full(len(alone), np.inf)
         for width in {len(self.columns[other]) for other in beside}:
-            alike = np.array([self.columns[other] for other in beside if len(self.columns[other]) == width])
-            least = np.minimum(least, self._left(information, sizes, variant, alike).min(1))
+            alike = np.array([self._places(other) for other in beside if len(self.columns[other]) == width])
+            inner = reduced.left[:, alike[:, :, None], alike[:, None]]
+            inner = inner + reduced.weak[:, alike][..., None] * np.eye(width)
+            mixed = reduced.left[:, alike][..., own]
+            left = alone[:, None] - mixed.swapaxes(2, 3) @ np.linalg.solve(inner, mixed)
+            least = np.minimum(least, _mean_fall(left, sizes).min(1))
         return least
 
-    def _left(self, information: Array, sizes: Array, variant: int, beside: NDArray[np.int64]) -> Array:
-        """Return the falls (M, O) beside each of O others, whose columns are given (O, w)."""
-        own = list(self.columns[variant])
-        others = np.concatenate([np.tile(np.arange(self.base), (len(beside), 1)), beside], 1)
-        inner = information[:, others[:, :, None], others[:, None]]
-        weak = np.diagonal(inner, axis1=2, axis2=3) * WEAK_SHARE + WEAK_SHARE
-        weak[..., : self.base] += self.prior
-        inner = inner + weak[..., None] * np.eye(others.shape[1])
-        mixed = information[:, others][..., own]
-        left = information[:, None, own][..., own] - mixed.swapaxes(2, 3) @ np.linalg.solve(inner, mixed)
-        return (np.diagonal(left, axis1=2, axis2=3) @ sizes**2 / len(own)).clip(0.0)
+    def _places(self, variant: int) -> list[int]:
+        """Return the columns of a variant among those of the candidates."""
+        return [column - self.base for column in self.columns[variant]]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Reduced:
+    """Information on the parameters of candidates (Q) with the nuisance parameters eliminated."""
+
+    left: Array
+    """The information, shape (M, Q, Q)."""
+    weak: Array
+    """What is added to the diagonal where a candidate is eliminated, shape (M, Q)."""
+
+
+def _mean_fall(left: Array, sizes: Array) -> Array:
+    """Return the falls of chi2 (...) by effects of given sizes (k,) about which information (..., k, k) is left."""
+    return (np.diagonal(left, axis1=-2, axis2=-1) @ sizes**2 / len(sizes)).clip(0.0)
 
 
 def contact_information(
@@ -224,7 +244,7 @@ def _eliminated(
     count = len(segments.items)
     columns: dict[int, Tensor] = {}
     first, loads = None, LoadErrors.of(segments.in_world(soft))
-    for part in batches(variants):
+    for part in batches(variants, alike=False):
         extended, own = with_variants(soft, part, "contact")
         parameters = [*known, *own]
         every = torch.cat([values, torch.zeros(len(own)).to(values)]).expand(count, len(parameters))
@@ -241,7 +261,7 @@ def _eliminated(
             columns[variants.index(variant)] = slopes[..., place : place + width]
             place += width
     assert first is not None  # there are candidates
-    states = first.jacobian.shape[-1] - len(known) - sum(len(v.parameters) for v in batches(variants)[0])
+    states = first.jacobian.shape[-1] - len(known) - sum(len(v.parameters) for v in batches(variants, alike=False)[0])
     pieces = [first.jacobian[..., : len(known)], *(columns[k] for k in range(len(variants)))]
     jacobian = torch.cat([*pieces, first.jacobian[..., -states:]], -1)
     size = jacobian.shape[-1] - states
@@ -298,11 +318,15 @@ def _of_impacts(
     world: World, base: ImpactBase, variants: Sequence[Variant]
 ) -> tuple[Array, Array, tuple[tuple[int, ...], ...]]:
     """Return the information (n, P, P) of impacts, the prior of the nuisance parameters, and each variant's columns."""
-    extended, own = with_variants(world, variants, "contact")
-    problem = replace(base.problem, world=extended, parameters=(*base.parameters, *own))
-    value = torch.cat([torch.as_tensor(base.fit.values), torch.zeros(len(own)).to(base.centre)])
-    slopes = problem.linear(value[None])[1][0]
+    together, first = Together.of(world, variants), len(base.parameters)
+    problem = replace(base.problem, world=together.world, parameters=(*base.parameters, *together.parameters))
+    value = torch.cat([torch.as_tensor(base.fit.values), base_values(together.world, together.parameters)])
+    owner = [-1] * first + [k for k, columns in enumerate(together.columns) for _ in columns]
+    free = [*range(first), *(first + column for columns in together.columns for column in columns)]
+    starts = value.repeat(1 + len(variants), 1)
+    together.set_constants(starts[1:], first)
+    slopes = problem.slopes(starts[[1 + k for k in owner]], torch.tensor(free))
     found = torch.einsum("nip,niq->npq", slopes, slopes).numpy()
-    place = {p.name: len(base.parameters) + k for k, p in enumerate(own)}
-    columns = tuple(tuple(place[name] for name in v.parameters) for v in variants)
+    ends = np.cumsum([first, *(len(columns) for columns in together.columns)]).tolist()
+    columns = tuple(tuple(range(a, b)) for a, b in itertools.pairwise(ends))
     return found, np.array([1 / p.prior[1] ** 2 for p in base.parameters]), columns

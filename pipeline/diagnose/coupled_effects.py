@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ..optimization.uncertainty import chi2_tail
+from ..optimization.tails import chi2_tail
 from ..physics.effects.effect import ActiveEffect
 from ..physics.world import World
 from ..segments.candidates import Candidate, base_parameters, base_values

@@ -93,7 +93,8 @@ def _lowest_limits(
     best: dict[int, _VariantLimit] = {}
     for part in batches(variants):
         start = [(started.base.segments, started.base.values[0])] * len(part)
-        fits = fit_sliding(started.segments.world, part, start, started.flight_parameters, iterations=1)
+        # the information where the fits begin, without a step
+        fits = fit_sliding(started.segments.world, part, start, started.flight_parameters, iterations=0)
         for variant, fit in zip(part, fits, strict=True):
             one = _variant_limit(
                 variant, fit, THRESHOLDS.experiment.safe * math.sqrt(least_chi2[len(variant.parameters) > 1])

@@ -20,7 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optimization.uncertainty import chi2_tail, f_tail, few_covariance
+from ..optimization.tails import chi2_tail, f_tail
+from ..optimization.uncertainty import few_covariance
 from ..physics.world import World
 from ..segments.candidates import base_values
 from ..segments.linearization import Linearization, layout, linearize, sums, widths

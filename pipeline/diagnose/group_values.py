@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..optimization.uncertainty import chi2_tail, student_tail
+from ..optimization.tails import chi2_tail, student_tail
 from ..physics.effects.effect import ActiveEffect
 from ..physics.effects.registry import load_effect
 from ..physics.parameters import Parameter, effect_parameters

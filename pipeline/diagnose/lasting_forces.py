@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..optimization.uncertainty import student_tail
+from ..optimization.tails import student_tail
 from ..physics.world import World
 from ..segments.candidates import base_parameters, base_values, without_effect
 from ..segments.segment_fit import projected

@@ -24,7 +24,7 @@ from ..physics.world import World
 from ..segments.candidates import Candidate, Variant, admissible, variants_of, without_effect
 from ..segments.contact_phases import is_round
 from ..segments.prepare import Prepared
-from .contact_information import Channel, contact_information
+from .contact_information import Channel, Reduced, contact_information
 from .experiments import described
 from .hand_motions import face_down, hand_motions
 from .thresholds import THRESHOLDS
@@ -70,15 +70,17 @@ class Question:
         seen, apart = (np.zeros((len(self.variants), len(more))) for _ in range(2))
         for channel in self.channels:
             information = _each(channel, chosen, more, times)
+            every = channel.reduced(information.reshape(-1, *information.shape[2:]))
+            first = Reduced(left=every.left[: len(more)], weak=every.weak[: len(more)])
             for place, name in enumerate(self.names):
                 if channel.name == "sliding" and name in THRESHOLDS.sliding.as_friction:
                     continue  # slides follow it by friction
-                own = _shown(channel, information, self.sizes[place], place)
+                own = channel.noncentrality(every, self.sizes[place], place).reshape(information.shape[:2])
                 full, rest = _needed(channel, self.variants[place])
                 # the others have to show it, too
                 enough = np.minimum(own[0] / full, own[1:].min(0) / rest)
                 rivals = [k for k, rival in enumerate(self.names) if rival != name and self._asked(name, rival)]
-                left = channel.noncentrality(information[0], self.sizes[place], place, rivals)
+                left = channel.noncentrality(first, self.sizes[place], place, rivals)
                 better = enough > seen[place]
                 lead = np.minimum(left / _lead(channel), 1e6)
                 seen[place] = np.where(better, enough, seen[place])
@@ -185,12 +187,6 @@ def _each(channel: Channel, chosen: Sequence[int], more: Sequence[int], times: i
     information = both + times * extra
     parts = [np.broadcast_to(one, extra.shape) for one in (*channel.episodes, *channel.motions[list(chosen)])]
     return np.stack([information, *(information - part for part in (*parts, extra))])
-
-
-def _shown(channel: Channel, information: Array, sizes: Array, variant: int) -> Array:
-    """Return the falls of chi2 (1 + E, M) by an effect of given sizes."""
-    flat = information.reshape(-1, *information.shape[2:])
-    return channel.noncentrality(flat, sizes, variant).reshape(information.shape[:2])
 
 
 def _needed(channel: Channel, variant: Variant) -> tuple[float, float]:

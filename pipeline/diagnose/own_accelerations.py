@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optimization.uncertainty import chi2_tail, f_tail
+from ..optimization.tails import chi2_tail, f_tail
 from ..segments.residual_wrench import ResidualWrenches
 from .thresholds import THRESHOLDS
 

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..optimization.uncertainty import chi2_tail
+from ..optimization.tails import chi2_tail
 from ..physics.effects.effect import ActiveEffect
 from ..physics.effects.registry import load_effect
 from ..physics.world import World

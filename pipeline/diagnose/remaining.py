@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ...schemas import PhaseMisfit, Remaining
-from ..optimization.uncertainty import student_quantile
+from ..optimization.tails import student_quantile
 from ..segments.contact_phases import PHASES, PhaseName, contact_phases
 from ..segments.prepare import whole_flights
 from ..segments.segment_states import fit_states

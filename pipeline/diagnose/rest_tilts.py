@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from ..geometry.rotation import quat_to_matrix
 from ..physics.world import Body
@@ -69,6 +68,8 @@ def rest_tilts(prepared: Prepared, body: Body) -> dict[int, Array]:
 
 def _face_normals(body: Body) -> Array:
     """Return the outward normals (F, 3) of the faces of a body's colliding spheres; none for a round one."""
+    from scipy.spatial import ConvexHull, QhullError  # dear to import, and seldom needed
+
     chosen = slice(None) if body.on_plane is None else body.on_plane
     points = body.centers[0].double()[chosen].numpy()
     radii = body.radii[0].double()[chosen].numpy()

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optimization.uncertainty import chi2_tail, normal_tail
+from ..optimization.tails import chi2_tail, normal_tail
 from ..segments.linearization import Linearization, eliminate, sums, widths
 from .thresholds import THRESHOLDS
 

@@ -79,6 +79,7 @@ JOINTED = (
 _LESS = "name a split with fewer episodes, or use a model with a longer step_s."
 
 
+@torch.inference_mode()
 @one_torch_thread()
 @reads("model", "capture", "throws")
 def diagnose(

@@ -8,7 +8,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, label, map_coordinates
 from scipy.spatial import KDTree
 
 from .solid_grid import Array, Faces, Volume, crossings, grid_points
@@ -46,6 +45,8 @@ def flattened(solid: Volume, face: NDArray[np.intp], planes: Array) -> Volume:
     field[near] = bounds.height(points[near])
     field = field.reshape(solid.distance.shape)
     inside = field < 0
+    from scipy.ndimage import label  # dear to import, and seldom needed
+
     parts, count = label(inside)  # type: ignore[misc]
     if count > 1:
         inside = parts == 1 + int(np.argmax(np.bincount(parts.reshape(-1))[1:]))
@@ -72,6 +73,8 @@ class _Bounds:
     @cached_property
     def _away(self) -> Array:
         """Distance [m] of the grid from the points of each face, and last from those of none, (F + 1, X, Y, Z)."""
+        from scipy.ndimage import distance_transform_edt  # dear to import, and seldom needed
+
         cells = np.rint((self.solid.surface - self.solid.origin) / self.solid.pitch).astype(int)
         cells = np.clip(cells, 0, np.array(self.solid.distance.shape) - 1)
         # infinite distances would not be numbers any more between grid points
@@ -85,6 +88,8 @@ class _Bounds:
 
     def _distances(self, points: Array) -> Array:
         """Return the distance [m] of points (n, 3) from the points of each face, and from those of none, (n, F + 1)."""
+        from scipy.ndimage import map_coordinates  # dear to import, and seldom needed
+
         place = ((points - self.solid.origin) / self.solid.pitch).T
         return np.stack([map_coordinates(one, place, order=1, mode="nearest") for one in self._away], 1)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+
+from ...datasets.capture.quaternions import matrices as quaternion_matrices
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -20,12 +21,12 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 def rotation_matrix(quat_wxyz: np.ndarray) -> np.ndarray:
     """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) of any norm; NaN where one has no direction.
 
-    scipy refuses quaternions that are zero or not finite, but validation reads them from damaged datasets.
+    Validation reads quaternions that are zero or not finite from damaged datasets.
     """
     quat_wxyz = np.asarray(quat_wxyz, float)
     norm = np.linalg.norm(quat_wxyz, axis=-1)
     directed = np.isfinite(norm) & (norm > 0)
     matrices = np.full((*norm.shape, 3, 3), np.nan)
     if directed.any():
-        matrices[directed] = Rotation.from_quat(quat_wxyz[directed], scalar_first=True).as_matrix()
+        matrices[directed] = quaternion_matrices(quat_wxyz[directed])
     return matrices

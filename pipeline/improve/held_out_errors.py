@@ -16,7 +16,7 @@ from ...schemas import ErrorRatio, FileModel
 from ..compare.paired_difference import LEAST_EPISODES, RESAMPLES
 from ..compare.short_horizon_errors import DIVERGED
 from ..diagnose.cross_validation import continued
-from ..optimization.uncertainty import student_quantile
+from ..optimization.tails import student_quantile
 from ..physics.world import World
 from ..runtime.resources import one_torch_thread
 from ..segments.prepare import Prepared, prepare

@@ -103,9 +103,10 @@ def batched_jacobian(function: Callable[[Tensor, int], Tensor], inputs: Tensor) 
         Values (B, M) and Jacobians (B, M, D).
     """
     batch, size = inputs.shape
-    repeated = inputs.detach().repeat(size, 1)
-    tangent = torch.eye(size, dtype=inputs.dtype, device=inputs.device).repeat_interleave(batch, 0)
-    with torch.no_grad(), forward_ad.dual_level(), _DenseTangents():
+    # in inference mode torch drops tangents without a word
+    with torch.inference_mode(False), torch.no_grad(), forward_ad.dual_level(), _DenseTangents():
+        repeated = inputs.detach().repeat(size, 1)
+        tangent = torch.eye(size, dtype=inputs.dtype, device=inputs.device).repeat_interleave(batch, 0)
         output, derivative = parts_of(function(dual_of(repeated, tangent), size))
     value = output[:batch]
     if derivative is None:

@@ -1,7 +1,4 @@
-"""Tail probabilities, quantiles and covariances of estimates.
-
-The distributions come from `scipy.special`, because importing `scipy.stats` takes half a second.
-"""
+"""Covariances and correlations of estimates."""
 
 from __future__ import annotations
 
@@ -9,36 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
 
 from ...schemas import Correlation
+from .tails import student_quantile
 
 Array = NDArray[np.float64]
-
-
-def chi2_tail(statistic: float, dof: float) -> float:
-    """Return the probability that chi2 with `dof` degrees of freedom exceeds a statistic."""
-    return float(chdtrc(dof, max(statistic, 0.0)))
-
-
-def f_tail(statistic: float, dof_above: float, dof_below: float) -> float:
-    """Return the probability that Fisher's F with the given degrees of freedom exceeds a statistic."""
-    return float(fdtrc(dof_above, dof_below, max(statistic, 0.0)))
-
-
-def normal_tail(z: float) -> float:
-    """Return the probability that a standard normal variable exceeds z."""
-    return float(ndtr(-z))
-
-
-def student_tail(t: float, dof: float) -> float:
-    """Return the probability that Student's t with `dof` degrees of freedom exceeds a value."""
-    return float(stdtr(dof, -t))
-
-
-def student_quantile(probability: float, dof: float) -> float:
-    """Return the quantile of Student's t with `dof` degrees of freedom."""
-    return float(stdtrit(dof, probability))
 
 
 def scaled_pinv(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

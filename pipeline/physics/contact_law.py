@@ -98,11 +98,18 @@ def coefficients(contact_time_s: Tensor, damping_ratio: Tensor, step_s: Tensor) 
     gap = 1 - zeta.square()
     below = gap > 0
     safe = torch.where(gap.abs() < 1e-12, torch.full_like(gap, 1e-12), gap.abs())
-    angle = safe.sqrt() * eta
-    trace = 2 * torch.exp(-zeta * eta) * torch.where(below, angle.cos(), angle.cosh())
-    determinant = torch.exp(-2 * zeta * eta)
+    angle, decay = safe.sqrt() * eta, torch.exp(-zeta * eta)
+    trace = 2 * decay * _swing(angle, below)
+    determinant = decay.square()
     k = 1 + determinant - trace
     return k, (3 - trace - determinant) / 2 - k
+
+
+def _swing(angle: Tensor, below: Tensor) -> Tensor:
+    """Return the cosine of angles of damping below 1, the hyperbolic cosine of others."""
+    if below.numel() == 1 and not below.is_cuda:  # one law for all: half of the work
+        return angle.cos() if bool(below) else angle.cosh()
+    return torch.where(below, angle.cos(), angle.cosh())
 
 
 def restitution(damping_ratio: Tensor) -> Tensor:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 Array = NDArray[Any]
@@ -262,6 +261,8 @@ def _thickness(centers: Array) -> float:
 
 def _ridges(points: Array) -> Corners:
     """Return the triples of points (n, 4) that may be ridges of their hull; of equal radii those of the hull in 3D."""
+    from scipy.spatial import ConvexHull, QhullError  # dear to import, and seldom needed
+
     level = np.ptp(points[:, 3]) < 1e-9
     used = points[:, :3] if level else points
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -114,6 +115,70 @@ def with_variants(world: World, variants: Sequence[Variant], kind: Kind) -> tupl
     everything = replace(world, effects=(*world.effects, *active))
     names = {name for variant in chosen for name in variant.parameters}
     return everything, [p for p in effect_parameters(everything) if p.name in names]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Together:
+    """Candidates in one world, in which those that differ in their constants alone are one effect."""
+
+    world: World
+    """The world with one effect for each candidate."""
+    parameters: list[Parameter]
+    """Parameters of the effects, then their constants, which are not fitted (Q)."""
+    columns: list[list[int]]
+    """Places of the parameters of each variant among them."""
+    constants: list[dict[int, float]]
+    """Constants of each variant by their places among them."""
+
+    @staticmethod
+    def of(world: World, variants: Sequence[Variant]) -> Together:
+        """Return a world with variants: as constants have a value for each item, the fused kernel takes them at once.
+
+        Args:
+            world: Without them.
+            variants: Of contact effects; those of one candidate may differ in their constants.
+        """
+        first: dict[int, Variant] = {}
+        for variant in variants:
+            first.setdefault(variant.place, variant)
+        everything, own = with_variants(world, list(first.values()), "contact")
+        fixed = [constant for variant in first.values() for constant in _constants(variant)]
+        place = {p.name: k for k, p in enumerate((*own, *fixed))}
+        columns, constants = [], []
+        for variant in variants:
+            shared = first[variant.place]
+            columns.append([place[name] for name in shared.parameters])
+            name = shared.active.effect.name
+            constants.append({place[f"{name}.{key}"]: value for key, value in variant.constants.items()})
+        return Together(world=everything, parameters=[*own, *fixed], columns=columns, constants=constants)
+
+    def set_constants(self, values: Tensor, first: int, each: int = 1) -> None:
+        """Write the constants into values (V each, P) of the variants, of each `each` rows.
+
+        Args:
+            values: The values.
+            first: Column of the first of `parameters`.
+            each: Number of rows of a variant.
+        """
+        for k, constants in enumerate(self.constants):
+            for column, value in constants.items():
+                values[k * each : (k + 1) * each, first + column] = value
+
+
+def _constants(variant: Variant) -> list[Parameter]:
+    """Return the constants of a variant as parameters; they are given, so that bounds and prior mean nothing."""
+    effect = variant.active.effect
+    return [
+        Parameter(
+            name=f"{effect.name}.{constant.name}",
+            unit=constant.unit,
+            bounds=(-math.inf, math.inf),
+            logarithmic=False,
+            reveals=effect.reveals,
+            prior=(constant.default, 1.0),
+        )
+        for constant in effect.constants
+    ]
 
 
 def without_effect(world: World, name: str) -> World:

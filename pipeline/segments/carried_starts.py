@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from ..physics.world import World
 from ..trajectories.observations import Observations
@@ -141,8 +141,9 @@ def _shape(before_s: Array, width_s: float) -> Array:
     if width_s <= 0:
         return 0.5 * before_s.clip(0.0) ** 2
     x = before_s / width_s
+    below = torch.special.ndtr(torch.as_tensor(x)).numpy()
     density = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
-    return 0.5 * width_s**2 * ((x**2 + 1) * ndtr(x) + x * density)
+    return 0.5 * width_s**2 * ((x**2 + 1) * below + x * density)
 
 
 def _left(steps: Sequence[Step]) -> float:

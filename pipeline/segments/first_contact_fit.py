@@ -19,15 +19,8 @@ from torch import Tensor
 from ...datasets.capture.tracks import Episode
 from ...schemas import Correlation, FittedParameter
 from ..optimization.levenberg_marquardt import Solution, minimise
-from ..optimization.uncertainty import (
-    ENOUGH_EPISODES,
-    REACH,
-    _wider,
-    correlation_of,
-    few_covariance,
-    inverse,
-    student_quantile,
-)
+from ..optimization.tails import student_quantile
+from ..optimization.uncertainty import ENOUGH_EPISODES, REACH, _wider, correlation_of, few_covariance, inverse
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.world import World
 from ..trajectories.correlated_noise import ROBUST_SCALE, WindowErrors

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...datasets.capture.tracks import Episode
-from ..optimization.uncertainty import student_quantile
+from ..optimization.tails import student_quantile
 from ..physics.parameters import Parameter
 from ..physics.world import World
 from ..trajectories.track_noise import Noise

@@ -180,13 +180,22 @@ class ImpactProblem:
 
     def linear(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return residuals (K, n, 6) in sigmas at values (K, P), and their derivatives (K, n, 6, P) by differences."""
-        steps = STEP * torch.tensor([p.prior[1] for p in self.parameters]).to(values)
-        high = torch.tensor([p.limits[1] for p in self.parameters]).to(values)
-        # step inwards where a step up would leave the bounds
-        steps = torch.where(values + steps > high, -steps, steps)
+        steps = self._steps(values)
         moved = torch.cat([values[:, None], values[:, None] + torch.diag_embed(steps)], 1)
         rows = self.rows(moved.flatten(0, 1)).unflatten(0, moved.shape[:2])
         return rows[:, 0], ((rows[:, 1:] - rows[:, :1]) / steps[:, :, None, None]).movedim(1, -1)
+
+    def slopes(self, values: Tensor, columns: Tensor) -> Tensor:
+        """Return the derivatives (n, 6, K) by one parameter each: columns (K,) at values (K, P) of equal residuals."""
+        steps = self._steps(values).gather(1, columns[:, None])
+        rows = self.rows(torch.cat([values[:1], values.scatter_add(1, columns[:, None], steps)]))
+        return ((rows[1:] - rows[:1]) / steps[:, :, None]).movedim(0, -1)
+
+    def _steps(self, values: Tensor) -> Tensor:
+        """Return the difference steps (K, P) at values (K, P): inwards where a step up would leave the bounds."""
+        steps = STEP * torch.tensor([p.prior[1] for p in self.parameters]).to(values)
+        high = torch.tensor([p.limits[1] for p in self.parameters]).to(values)
+        return torch.where(values + steps > high, -steps, steps)
 
 
 def fit_impacts(problem: ImpactProblem, start: Tensor, centre: Tensor | None = None) -> ImpactFit:

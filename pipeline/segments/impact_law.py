@@ -136,13 +136,18 @@ def after_impact(impact: Impact, law: ContactLaw, effects: Sequence[ActiveEffect
     stopping = -torch.linalg.inv(across @ k @ across.T)
     by_slice = slice_[:, None] * ((k @ normal) @ across.T)
     spun = torch.linalg.inv(impact.inertia)
+    acting = any(active.effect.has("contact") for active in effects)
+    touch = _touched(impact, law, effects, point_velocity(twist, impact.arm), twist[:, 3:])
+    cone = _cone(touch)
     for _ in range(SLICES):
         u = point_velocity(twist, impact.arm)
-        touch = _touched(impact, law, effects, u, twist[:, 3:])
+        if acting:
+            touch = _touched(impact, law, effects, u, twist[:, 3:])
+            cone = _cone(touch)
         # the impulse that would stop the slip, including the change of slip by the normal impulse
         slip = u @ across.T + by_slice
         wanted = (stopping @ slip[..., None])[..., 0]
-        friction = within_cone(wanted, slip, _cone(touch), slice_)
+        friction = within_cone(wanted, slip, cone, slice_)
         push = slice_[:, None] * normal + friction @ across
         turn = torch.linalg.cross(impact.arm, push)
         twist = twist + torch.cat([push / impact.mass[:, None], (spun @ turn[..., None])[..., 0]], -1)
@@ -180,6 +185,8 @@ def _cone(touch: Touch) -> Tensor:
 
 def _braked(impact: Impact, touch: Touch, slice_: Tensor, twist: Tensor) -> Tensor:
     """Return the twists after one increment's torque against rolling and spinning, which reverses neither."""
+    if touch.rolling_m is None and touch.torsion_m is None:
+        return twist
     normal, omega = impact.normal, twist[:, 3:]
     spin = (omega @ normal)[:, None] * normal
     for size, part in ((touch.rolling_m, omega - spin), (touch.torsion_m, spin)):

@@ -23,7 +23,8 @@ from torch import Tensor
 from ...datasets.capture.tracks import Episode
 from ...schemas import FittedParameter, ModelFile
 from ..optimization.levenberg_marquardt import Solution, minimise
-from ..optimization.uncertainty import correlation_of, student_quantile
+from ..optimization.tails import student_quantile
+from ..optimization.uncertainty import correlation_of
 from ..physics.effects.registry import effect_of
 from ..physics.parameters import GROUND_SHIFT, Parameter, apply_parameters
 from ..physics.world import World

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optimization.uncertainty import student_tail
+from ..optimization.tails import student_tail
 from .residual_wrench import ResidualWrenches
 from .thresholds import SEGMENT_THRESHOLDS
 

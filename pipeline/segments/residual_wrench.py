@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..geometry.rotation import quat_rotate
-from ..optimization.uncertainty import chi2_tail
+from ..optimization.tails import chi2_tail
 from ..physics.effects.effect import ActiveEffect, BodyMotion, Effect
 from ..physics.effects.linear_drag import LinearDrag
 from ..physics.effects.magnus_lift import MagnusLift

@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
-from ..optimization.uncertainty import REACH, student_quantile
+from ..optimization.tails import student_quantile
+from ..optimization.uncertainty import REACH
 from ..physics.contact_law import ContactLaw
 from ..physics.world import World
 from ..trajectories.observations import Observations
@@ -338,6 +338,8 @@ class _Speeds:
             noise: That of the heights.
             degrees: Degrees of freedom that it was found with.
         """
+        from scipy.linalg import cho_factor, cho_solve  # dear to import, and seldom needed
+
         fall, rise = self.speeds.T
         count = len(fall)
         own = rise / fall

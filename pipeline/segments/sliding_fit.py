@@ -18,7 +18,7 @@ from ..physics.parameters import FRICTION, GROUND_SHIFT, Parameter, effect_param
 from ..physics.world import State, World
 from ..trajectories.bursts import without_grounded_bursts
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals
-from .candidates import Variant, base_parameters, base_values, with_variants
+from .candidates import Together, Variant, base_parameters, base_values
 from .linearization import linearize, sums
 from .prepare import Prepared
 from .segments import Segments, line_state
@@ -88,7 +88,7 @@ def _base(segments: Segments, frictions: Sequence[Tensor], flight_parameters: Se
     The guesses are the median over segments and the contact law's value: a single segment can mislead the former, and a
     wrong friction is a local minimum.
     """
-    tried = (fit_sliding(segments.world, [], [(segments, one)], flight_parameters)[0] for one in frictions)
+    tried = fit_sliding(segments.world, [], [(segments, one) for one in frictions], flight_parameters)
     return min(tried, key=lambda fit: fit.cost)
 
 
@@ -124,19 +124,18 @@ def fit_sliding(
         world: With the soft contact.
         variants: To fit, all in one batch.
         starts: For each variant, segments with states, and the values to start from, of a fit without or with it: as
-            many of the first parameters as are known.
+            many of the first parameters as are known. Without variants, each start is fitted.
         flight_parameters: Parameters estimated in flight, with their standard errors as priors.
         iterations: Maximum number of steps.
     """
-    candidates_world, own = with_variants(world, variants, "contact")
+    every = Together.of(world, variants)
     known = nuisance_parameters(world, flight_parameters)
-    parameters = [*known, *own]
-    place = {p.name: k for k, p in enumerate(parameters)}
-    shared = list(range(len(known)))
-    rows = [[*shared, *(place[name] for name in v.parameters)] for v in variants] or [shared]
+    parameters, shared = [*known, *every.parameters], list(range(len(known)))
+    rows = [[*shared, *(len(known) + k for k in columns)] for columns in every.columns] or [shared] * len(starts)
     size, count = max(map(len, rows)), len(starts[0][0].items)
     free = torch.tensor([row + [-1] * (size - len(row)) for row in rows])
-    values = base_values(candidates_world, parameters).repeat(len(rows), 1)
+    values = base_values(every.world, parameters).repeat(len(rows), 1)
+    every.set_constants(values, len(known))
     middle = values.clone()
     for k, (row, (_, value)) in enumerate(zip(rows, starts, strict=True)):
         given = value.reshape(-1)
@@ -144,10 +143,10 @@ def fit_sliding(
     free_start = [k for k, p in enumerate(parameters) if p not in flight_parameters]
     middle[:, free_start] = values[:, free_start]
     segments = starts[0][0]
-    every = segments.in_world(candidates_world).select(list(range(count)) * len(rows))
-    every = every.with_state(State.joined(*(one.observations.state for one, _ in starts)))
+    some = segments.in_world(every.world).select(list(range(count)) * len(rows))
+    some = some.with_state(State.joined(*(one.observations.state for one, _ in starts)))
     group = torch.arange(len(rows)).repeat_interleave(count)
-    found = fit_groups(every, parameters, values, free, group, iterations, middle)
+    found = fit_groups(some, parameters, values, free, group, iterations, middle)
     fits = []
     for k, row in enumerate(rows):
         chosen = slice(k * count, (k + 1) * count)
@@ -173,36 +172,35 @@ def better_starts(
         fits: Of the variants.
         flight_parameters: See :func:`fit_sliding`.
     """
-    candidates_world, own = with_variants(world, variants, "contact")
+    together = Together.of(world, variants)
     known = nuisance_parameters(world, flight_parameters)
-    parameters = [*known, *own]
-    place = {p.name: k for k, p in enumerate(parameters)}
+    parameters = [*known, *together.parameters]
+    columns_of = [[len(known) + k for k in columns] for columns in together.columns]
     count, each = len(fits[0].segments.items), len(FACTORS)
-    values = base_values(candidates_world, parameters).repeat(len(variants) * each, 1)
-    low, high = torch.tensor([p.limits for p in own]).to(values).T
-    for k, (variant, fit) in enumerate(zip(variants, fits, strict=True)):
-        columns = [place[name] for name in variant.parameters]
+    values = base_values(together.world, parameters).repeat(len(variants) * each, 1)
+    together.set_constants(values, len(known), each)
+    low, high = torch.tensor([p.limits for p in together.parameters]).to(values).T
+    for k, (columns, fit) in enumerate(zip(columns_of, fits, strict=True)):
         rows = slice(k * each, (k + 1) * each)
         values[rows, : len(known)] = fit.values[0, : len(known)]
         values[rows, columns] = torch.tensor(FACTORS).to(values)[:, None] * fit.values[0, len(known) :]
     values[:, len(known) :] = torch.minimum(torch.maximum(values[:, len(known) :], low), high)
     values, owner, place_of = _distinct(values, each)
-    every = fits[0].segments.in_world(candidates_world).select(list(range(count)) * len(values))
+    every = fits[0].segments.in_world(together.world).select(list(range(count)) * len(values))
     every = every.with_state(State.joined(*(fits[k].segments.observations.state for k in owner)))
     free = torch.arange(len(known)).expand(len(values), -1)
     group = torch.arange(len(values)).repeat_interleave(count)
     found = fit_groups(every, parameters, values, free, group, HELD_ITERATIONS)
     costs = found.chi2.unflatten(0, (len(values), count)).sum(-1)[place_of]
     starts = []
-    for k, (variant, fit) in enumerate(zip(variants, fits, strict=True)):
+    for k, (columns, fit) in enumerate(zip(columns_of, fits, strict=True)):
         best = int(costs[k].argmin())
         if float(costs[k, best]) >= fit.cost:
             starts.append((fit.segments, fit.values[0]))
             continue
         row = int(place_of[k, best])
         states = found.segments.observations.state.at(torch.arange(row * count, (row + 1) * count))
-        columns = [*range(len(known)), *(place[name] for name in variant.parameters)]
-        starts.append((fit.segments.with_state(states), found.values[row, columns]))
+        starts.append((fit.segments.with_state(states), found.values[row, [*range(len(known)), *columns]]))
     return starts
 
 

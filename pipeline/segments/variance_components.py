@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from ..optimization.least_squares import Policy, descend
 from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
@@ -73,6 +72,7 @@ def variance_components(
 
 def _white(likelihood: RestrictedLikelihood) -> float:
     """Return the largest restricted log-likelihood of independent errors."""
+    from scipy.optimize import minimize_scalar  # seldom needed, and dear to import
 
     def loss(log_std: float) -> float:
         sizes = Components(white=math.exp(2 * log_std), fast=0.0, time_s=1.0, order=0.5)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from ..geometry.flat_solid import flattened
 from ..geometry.solid_grid import Array, Volume
@@ -226,6 +225,8 @@ class Curves:
 
         From `start`, whose columns come first, or from the best plane of a coarse grid.
         """
+        from scipy.optimize import minimize  # dear to import, and seldom needed
+
         step = float(self.offsets[1] - self.offsets[0])
         if start is None:
             tilts = (-5 * step, 0.0, 5 * step)

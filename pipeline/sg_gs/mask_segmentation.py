@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from ...datasets.capture.cameras import Camera
 from ...datasets.capture.capture import Capture
@@ -283,6 +282,8 @@ class _Solid:
 
 def _look_up(row: Array, points: Array, mask: Mask, hidden: Mask, camera: Camera) -> None:
     """Write the depth of points (n, 3) inside a mask [m] into `row` (n,), where the photo may show them."""
+    from scipy.ndimage import map_coordinates  # dear to import, and seldom needed
+
     signed = signed_distance_px(mask)
     pixel, depth = camera.project(points)
     seen = (depth > 0) & (pixel > 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)

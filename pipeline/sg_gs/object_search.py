@@ -13,8 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
@@ -222,6 +220,9 @@ class ObjectSearch:
 
     def _clusters(self, spheres: Spheres, count: int, pitch: float) -> list[NDArray[np.int64]]:
         """Return the connected clusters of the grid's spheres that are solid and clear of the ground."""
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components  # dear to import, and seldom needed
+
         means, scales = spheres.means.numpy(), spheres.scales.numpy()
         solid = (spheres.opacities[:count].numpy() > _SOLID) & (self._height(means[:count]) > 0.2 * pitch)
         chosen = np.flatnonzero(solid)

@@ -13,7 +13,6 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, map_coordinates
 
 from ...schemas import Ground, InputDataError
 from ..geometry.directions import fibonacci_directions
@@ -150,6 +149,8 @@ def _refined(
     ground: Ground | None,
 ) -> tuple[Array, Array, float]:
     """Crop the grid to the body and refine it, twice; only points near the surface are evaluated again."""
+    from scipy.ndimage import map_coordinates  # dear to import, and seldom needed
+
     # A grid finer than the pixels would hold nothing more.
     pixel = float(np.median([view.pixel_at(origin + 0.5 * pitch * np.array(coarse.shape)) for view in views]))
     for level in range(2):
@@ -185,6 +186,8 @@ def signed_distance_px(mask: NDArray[np.bool_]) -> Array:
 
 def _field(points: Array, views: Sequence[Silhouette], fields: Sequence[Array], ground: Ground | None) -> Array:
     """Return the approximate signed distance of points (n, 3) from the hull [m], positive inside, shape (n,)."""
+    from scipy.ndimage import map_coordinates  # dear to import, and seldom needed
+
     result = np.full(points.shape[0], np.inf)
     seen = np.zeros(points.shape[0], dtype=np.int32)
     fused = _FusedDepth(points.shape[0])
@@ -283,6 +286,8 @@ def _bounds(views: Sequence[Silhouette]) -> tuple[Array, float]:
 
 def largest_component(inside: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     """Return the largest connected part of a grid, or None if nothing is inside."""
+    from scipy.ndimage import label  # dear to import, and seldom needed
+
     labels, count = label(inside)  # type: ignore[misc]
     if count == 0:
         return None

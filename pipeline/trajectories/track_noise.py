@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+
+from ...datasets.capture.quaternions import turns
 
 if TYPE_CHECKING:
     from ...datasets.capture.tracks import Track
@@ -70,11 +71,7 @@ def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> Noise:
         t = track.time_s[rows] - track.time_s[rows].mean(1, keepdims=True)
         positions.append(polynomial_residuals(t, track.position_m[:, moves(track.position_m)][rows], degree).ravel())
         if track.quat_wxyz is not None:
-            middle, turn = (
-                Rotation.from_quat(track.quat_wxyz[frames], scalar_first=True)
-                for frames in (np.repeat(rows[:, WINDOW // 2], window), rows.ravel())
-            )
-            turned = (middle.inv() * turn).as_rotvec().reshape(*rows.shape, 3)
+            turned = turns(track.quat_wxyz[rows[:, WINDOW // 2], None], track.quat_wxyz[rows])
             rotations.append(polynomial_residuals(t, turned, degree).ravel())
     return Noise(max(spread(positions), FLOOR_M), max(spread(rotations), FLOOR_RAD))
 

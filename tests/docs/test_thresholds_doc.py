@@ -78,6 +78,7 @@ NUMERICS = {
     "robust_fit.FALL": "end of a descent",
     "segments.MOST_FITTED": "which effects are fitted",
     "robust_fit.ITERATIONS": "end of a descent",
+    "robust_fit.MOST_NUMBERS": "size of a batch",
     "robust_fit.STEPS": "lengths of a step that are tried",
     "hand_motions.INSIDE": "tolerance of a geometric test",
     "hand_motions.MOST_AHEAD_M": "where a proposed motion begins",

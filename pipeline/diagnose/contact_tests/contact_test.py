@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...optimization.uncertainty import chi2_tail
+from ...optimization.tails import chi2_tail
 from ...physics.effects.effect import ActiveEffect
 from ...physics.world import World
 from ...segments.candidates import Candidate, Variant, variants_of

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...optimization.uncertainty import f_tail
+from ...optimization.tails import f_tail
 from ...physics.contact_law import ContactLaw
-from ...segments.candidates import Candidate, Variant
-from ...segments.impact_fit import BASE, ImpactBase, ImpactFit, ImpactProblem, fit_impacts
+from ...segments.candidates import Candidate, Together, Variant, base_values
+from ...segments.impact_fit import BASE, ImpactBase, ImpactFit, fit_impacts
 from ...segments.impact_velocities import measured_impacts
 from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ..evidence import Evidence
@@ -57,10 +57,10 @@ class ImpactTest(ContactTest):
         if impacts is None or len(impacts) < SEGMENT_THRESHOLDS.impact_data.least:
             return []
         base = ImpactBase.of(data.world, impacts)
-        found = []
-        for variant in data.variants(candidates):
-            problem, start = base.beside(variant)
-            if _change(problem, start, len(base.parameters)) > self.limits.shown:
+        found, variants = [], data.variants(candidates)
+        for variant, change in zip(variants, _changes(base, variants), strict=True):
+            if change > self.limits.shown:
+                problem, start = base.beside(variant)
                 found.append((variant, fit_impacts(problem, start, centre=base.centre_of(start))))
         if not found:
             return []
@@ -93,17 +93,27 @@ class ImpactTest(ContactTest):
         return (replace(self._without_gains, gain_t=self.limits.gain_t, carriers=carriers, carries=slides.carries),)
 
 
-def _change(problem: ImpactProblem, start: torch.Tensor, base: int) -> float:
-    """Return the change of the impacts [chi2] by an effect of the usual size, of either sign where both are allowed."""
-    moves = []
-    for place, parameter in enumerate(problem.parameters[base:], base):
-        scale = parameter.prior[1] / 5
-        for sign in (1.0,) if parameter.bounds[0] == 0 else (1.0, -1.0):
-            moved = start.clone()
-            moved[place] += sign * scale
-            moves.append(moved)
-    rows = problem.rows(torch.stack([start, *moves]))
-    return float((rows[1:] - rows[:1]).square().sum((1, 2)).max())
+def _changes(base: ImpactBase, variants: Sequence[Variant]) -> list[float]:
+    """Return the change of the impacts [chi2] by each effect of the usual size, of either sign where both may be."""
+    if not variants:
+        return []
+    together, first = Together.of(base.problem.world, variants), len(base.parameters)
+    problem = replace(base.problem, world=together.world, parameters=(*base.parameters, *together.parameters))
+    start = torch.cat([torch.as_tensor(base.fit.values), base_values(together.world, together.parameters)])
+    starts = start.repeat(len(variants), 1)
+    together.set_constants(starts, first)
+    moves, owner = [], []
+    for k, columns in enumerate(together.columns):
+        for column in columns:
+            parameter = together.parameters[column]
+            for sign in (1.0,) if parameter.bounds[0] == 0 else (1.0, -1.0):
+                moved = starts[k].clone()
+                moved[first + column] += sign * parameter.prior[1] / 5
+                moves.append(moved)
+                owner.append(k)
+    rows = problem.rows(torch.cat([starts, torch.stack(moves)]))
+    change = (rows[len(variants) :] - rows[owner]).square().sum((1, 2))
+    return [float(change[[k == one for one in owner]].max()) for k in range(len(variants))]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,14 @@ from ...segments.segments import Segments
 from ..candidate_fit import CandidateFit, candidate_fits
 from ..effect_selection import repeats
 from ..evidence import Evidence
-from ..robust_fit import RobustFit, losses_by_others, robust_fit, robust_repetition, with_segment_parameters
+from ..robust_fit import (
+    RobustFit,
+    losses_by_others,
+    robust_fit,
+    robust_fits,
+    robust_repetition,
+    with_segment_parameters,
+)
 from ..thresholds import THRESHOLDS, SegmentsThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
 
@@ -152,14 +159,19 @@ class _Test:
         evidence = _judged(one.candidate, one.constants, at, self.without, _penalty(fit.linear), tries)
         return replace(self, evidence=evidence, linear=fit.linear, columns=list(fit.columns), start=fit.start)
 
-    def told(self, tried: int) -> Evidence:
+    @property
+    def every(self) -> list[int]:
+        """Columns of the model's parameters and of the candidate's."""
+        return [*range(self.linear.base), *self.columns]
+
+    def told(self, tried: int, lost: Array) -> Evidence:
         """Return the evidence with the gains of held-out episodes, and the repetition where its score is positive.
 
         Args:
             tried: Number of effects among which it was looked for.
+            lost: Loss of each held-out episode with the candidate.
         """
-        base = list(range(self.linear.base))
-        gains = self.lost - losses_by_others(self.linear, [*base, *self.columns], self.start)
+        base, gains = list(range(self.linear.base)), self.lost - lost
         score = self.evidence.score if self.evidence.test.admissible else -math.inf
         repeated = robust_repetition(self.linear, base, self.columns, tried, self.start) if score > 0 else None
         return replace(self.evidence, gains=tuple(gains.tolist()), score=score, repetition=repeated)
@@ -171,11 +183,11 @@ def _linear_tests(
     """Return the tests of all variants in segments linearised without any of them."""
     linear = with_segment_parameters(linearize(segments, data.world, variants, data.prepared.groups, robust=True))
     base = list(range(linear.base))
-    without, lost, tries = robust_fit(linear, base), losses_by_others(linear, base), tries_of(variants)
+    without, lost, tries = robust_fit(linear, base), losses_by_others(linear, [base])[0], tries_of(variants)
     penalty, tests = _penalty(linear), []
-    for variant in variants:
-        columns = linear.columns(variant.parameters)
-        fit = robust_fit(linear, [*base, *columns])
+    every = [linear.columns(variant.parameters) for variant in variants]
+    fits = robust_fits(linear, [[*base, *columns] for columns in every])
+    for variant, columns, fit in zip(variants, every, fits, strict=True):
         one = _judged(candidates[variant.place], variant.constants, fit, without, penalty, tries[variant.place])
         start = np.zeros(len(linear.parameters))
         tests.append(_Test(evidence=one, linear=linear, columns=columns, start=start, without=without, lost=lost))
@@ -189,7 +201,21 @@ def _ranked(tests: Sequence[_Test], data: ContactData) -> list[Evidence]:
     shown = _first_of_slides(data)
     # what slides rank first is the only hypothesis; without them the best of all effects is looked at
     tried = [1 if shown is not None and shown.name == one.name else len(best) for one in best]
-    return ranked(own[id(one)].told(count) for one, count in zip(best, tried, strict=True))
+    tests = [own[id(one)] for one in best]
+    return ranked(one.told(count, lost) for one, count, lost in zip(tests, tried, _held_out(tests), strict=True))
+
+
+def _held_out(tests: Sequence[_Test]) -> list[Array]:
+    """Return the loss (E,) of each held-out episode with the candidate of each test."""
+    alike: dict[tuple[int, bytes], list[int]] = {}
+    for k, one in enumerate(tests):
+        alike.setdefault((id(one.linear), one.start.tobytes()), []).append(k)
+    found: dict[int, Array] = {}
+    for some in alike.values():
+        first = tests[some[0]]
+        lost = losses_by_others(first.linear, [tests[k].every for k in some], first.start)
+        found |= dict(zip(some, lost, strict=True))
+    return [found[k] for k in range(len(tests))]
 
 
 def _penalty(linear: Linearization) -> float:

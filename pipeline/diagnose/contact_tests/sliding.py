@@ -210,8 +210,13 @@ def _starts(part: Sequence[Variant], started: StartedSliding) -> list[tuple[Segm
     known = [(base.segments, base.values[0])] * len(part)
     if base.cost < SEGMENT_THRESHOLDS.sliding_data.well_fitted * float(started.segments.dof.sum()):
         return known
-    separate = separate_starts(started, part)
-    return [one[:2] if one[2] < base.cost else other for one, other in zip(separate, known, strict=True)]
+    separate = {
+        id(v): one
+        for some in batches(part, alike=False)
+        for v, one in zip(some, separate_starts(started, some), strict=True)
+    }
+    found = (separate[id(variant)] for variant in part)
+    return [one[:2] if one[2] < base.cost else other for one, other in zip(found, known, strict=True)]
 
 
 def _continued(
@@ -230,26 +235,30 @@ def _continued(
     return done
 
 
-def batches(variants: Sequence[Variant]) -> list[list[Variant]]:
-    """Split variants into batches that are fitted at once, in order.
+def batches(variants: Sequence[Variant], alike: bool = True) -> list[list[Variant]]:
+    """Split variants into batches that are computed at once, in order.
 
     The fused kernel takes one effect of a kind; variants of many parameters slow a batch down and are kept apart.
+
+    Args:
+        variants: The variants.
+        alike: Whether a batch may have a candidate with several values of its constants, one for each item.
     """
     parts: list[list[Variant]] = []
     for variant in variants:
-        many = len(variant.parameters) > MANY
-        fits = (
-            part
-            for part in parts
-            if many == (len(part[0].parameters) > MANY)
-            and all(type(other.active.effect) is not type(variant.active.effect) for other in part)
-        )
-        part = next(fits, None)
+        part = next((part for part in parts if all(_go_together(one, variant, alike) for one in part)), None)
         if part is None:
             parts.append([variant])
         else:
             part.append(variant)
     return parts
+
+
+def _go_together(one: Variant, other: Variant, alike: bool) -> bool:
+    """Return whether two variants may be in one batch."""
+    if (len(one.parameters) > MANY) != (len(other.parameters) > MANY):
+        return False
+    return type(one.active.effect) is not type(other.active.effect) or (alike and one.place == other.place)
 
 
 def _judged(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from ...optimization.forward_mode import batched_jacobian
 from ...physics.contact_law import damping_ratio_of, restitution
 from ...physics.parameters import DAMPING_RATIO, Parameter
 from ...physics.world import World
@@ -29,10 +30,10 @@ def damping_of(bounces: RestitutionFit) -> BounceDamping:
     """Return the damping ratio that gives a restitution, with its variance to first order."""
     limits = restitution(torch.tensor(DAMPING_RATIO.bounds, dtype=torch.float64))
     wanted = torch.tensor(bounces.estimate, dtype=torch.float64).clamp(float(limits[1]) + 1e-6, float(limits[0]) - 1e-6)
-    z = damping_ratio_of(wanted).log().requires_grad_()
-    (slope,) = torch.autograd.grad(restitution(z.exp()), z)
+    z = damping_ratio_of(wanted).log()[None, None]
+    _, slope = batched_jacobian(lambda values, _: restitution(values.exp()), z)
     variance = (bounces.std_error / float(slope)) ** 2
-    return BounceDamping(value=float(z.detach()), variance=variance, bounces=len(bounces.own))
+    return BounceDamping(value=float(z), variance=variance, bounces=len(bounces.own))
 
 
 def with_bounces(

@@ -25,6 +25,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from ....datasets.capture.tracks import Episode, Track
 from ....datasets.io.progress import note
@@ -88,6 +89,7 @@ NEVER_TOUCHES = (
 """Warning for a fit in which no body touches anything; the values are prior or earlier ones."""
 
 
+@torch.inference_mode()
 @one_torch_thread()
 def fit_physics(
     world: World,

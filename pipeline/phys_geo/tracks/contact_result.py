@@ -14,6 +14,7 @@ from ....datasets.capture.tracks import Track
 from ....datasets.shapes.ply import Splats
 from ....schemas import ContactParameters, Correlation, FitChoice, FittedParameter, PairContact
 from ....schemas.materials import of_pair
+from ...optimization.forward_mode import batched_jacobian
 from ...optimization.uncertainty import correlation_of
 from ...physics.contact_law import ContactLaw, restitution
 from ...physics.paper_law import PaperLaw
@@ -348,13 +349,12 @@ def _derived_of(
         "stiffness_n_m": ("N/m", lambda z: mass / z[tau].exp().square()),
         "damping_n_s_m": ("N s/m", lambda z: 2 * z[zeta].exp() * mass / z[tau].exp()),
     }
-    derived = []
-    for name, (unit, formula) in formulas.items():
-        z = torch.tensor(best, dtype=torch.float64, requires_grad=True)
-        value = formula(z)
-        (slope,) = torch.autograd.grad(value, z)
-        std = math.sqrt(float(slope.numpy() @ covariance @ slope.numpy()))
-        estimate = float(value.detach())
+    derived, z = [], torch.tensor(best, dtype=torch.float64)[None]
+    values, slopes = batched_jacobian(
+        lambda inputs, _: torch.stack([formula(inputs.unbind(1)) for _, formula in formulas.values()], 1), z
+    )
+    for (name, (unit, _)), estimate, slope in zip(formulas.items(), values[0].tolist(), slopes[0].numpy(), strict=True):
+        std = math.sqrt(float(slope @ covariance @ slope))
         reach = math.exp(min(1.96 * std / estimate, 30.0))  # first order in the logarithm, as they are positive
         note = (
             "speed ratio of a head-on impact" if name == "restitution" else f"of one contact that carries {mass:g} kg"

@@ -18,7 +18,7 @@ from cgwm.pipeline.diagnose.flight_equals import fitted_contact, resolved_flight
 from cgwm.pipeline.diagnose.score_test import ScoreTest, score_test
 from cgwm.pipeline.diagnose.sparse_regression import residual_law
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
-from cgwm.pipeline.optimization.uncertainty import student_quantile, student_tail
+from cgwm.pipeline.optimization.tails import student_quantile, student_tail
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.effects.gravity_tilt import GravityTilt
 from cgwm.pipeline.physics.effects.registry import BUILT_IN

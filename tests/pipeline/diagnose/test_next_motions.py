@@ -76,7 +76,7 @@ def test_the_motion_asked_for_shows_viscous_friction_better_than_most() -> None:
     channels, _ = contact_information(data, world, started, variants, motions)
     (sliding,) = [channel for channel in channels if channel.name == "sliding"]
     sizes = np.array([0.1])
-    shown = sliding.noncentrality(sliding.data + sliding.motions, sizes, 0)
+    shown = sliding.noncentrality(sliding.reduced(sliding.data + sliding.motions), sizes, 0)
     question = Question(
         variants=tuple(variants),
         names=("viscous_friction", "anisotropic_friction"),
@@ -88,7 +88,7 @@ def test_the_motion_asked_for_shows_viscous_friction_better_than_most() -> None:
     assert shown[first] > 2 * np.median(shown)
     assert motions[first].speed_m_s == max(motion.speed_m_s for motion in motions)
     # slides along one direction cannot tell a friction by direction from a friction
-    aside = sliding.noncentrality(sliding.data + sliding.motions, np.full(2, 0.05), 1)
+    aside = sliding.noncentrality(sliding.reduced(sliding.data + sliding.motions), np.full(2, 0.05), 1)
     headings = np.array([motion.heading_deg for motion in motions])
     slides = np.array([motion.manner == "slide" and motion.speed_m_s == 2.0 for motion in motions])
     assert aside[slides & (headings % 180 == 90)].min() > aside[slides & (headings % 180 == 0)].max()
@@ -107,11 +107,11 @@ def test_of_the_rivals_of_an_effect_the_one_that_imitates_it_best_counts() -> No
         inner = one[np.ix_(others, others)] + np.diag([2.0, *np.zeros(len(others) - 1)])
         return 0.25 * float(one[1, 1] - one[1, others] @ np.linalg.solve(inner, one[others, 1]))
 
-    alone = channel.noncentrality(motions, np.array([0.5]), 0)
+    alone = channel.noncentrality(channel.reduced(motions), np.array([0.5]), 0)
     assert alone == pytest.approx([fall(one, [0]) for one in motions], rel=1e-6)
-    beside = channel.noncentrality(motions, np.array([0.5]), 0, [1, 2, 3])
+    beside = channel.noncentrality(channel.reduced(motions), np.array([0.5]), 0, [1, 2, 3])
     assert beside == pytest.approx([min(fall(one, [0, *columns[k]]) for k in (1, 2, 3)) for one in motions], rel=1e-6)
-    assert np.isinf(channel.noncentrality(motions, np.array([0.5]), 0, [])).all()
+    assert np.isinf(channel.noncentrality(channel.reduced(motions), np.array([0.5]), 0, [])).all()
 
 
 @pytest.mark.parametrize(("known", "asked"), [(1e9, 0), (0.0, 3)])

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from cgwm.pipeline.optimization.importance_sampling import _moments
-from cgwm.pipeline.optimization.uncertainty import chi2_tail, correlation_of, f_tail, normal_tail, student_quantile
+from cgwm.pipeline.optimization.tails import chi2_tail, f_tail, normal_tail, student_quantile, student_tail
+from cgwm.pipeline.optimization.uncertainty import correlation_of
 from scipy import stats
 
 
@@ -11,13 +12,16 @@ from scipy import stats
 def test_probabilities(x: float) -> None:
     assert chi2_tail(x, 2.5) == pytest.approx(stats.chi2.sf(x, 2.5), rel=1e-12)
     assert f_tail(x, 3, 40.0) == pytest.approx(stats.f.sf(x, 3, 40.0), rel=1e-12)
+    assert f_tail(x, 9, 2000.0) == pytest.approx(stats.f.sf(x, 9, 2000.0), rel=1e-10, abs=1e-290)
     assert normal_tail(x) == pytest.approx(stats.norm.sf(x), rel=1e-12)
+    for dof in (1, 2.5, 300):
+        assert student_tail(x, dof) == pytest.approx(stats.t.sf(x, dof), rel=1e-11)
 
 
-@pytest.mark.parametrize("dof", [1, 2.5, 30])
+@pytest.mark.parametrize("dof", [1, 2.5, 30, 4000])
 def test_quantiles(dof: float) -> None:
-    for probability in (0.05, 0.5, 0.975):
-        assert student_quantile(probability, dof) == pytest.approx(stats.t.ppf(probability, dof), rel=1e-12, abs=1e-12)
+    for probability in (1e-6, 0.05, 0.5, 0.975, 0.9999):
+        assert student_quantile(probability, dof) == pytest.approx(stats.t.ppf(probability, dof), rel=1e-11, abs=1e-12)
 
 
 def test_parameters_that_do_the_same_are_correlated_by_no_more_than_1() -> None:

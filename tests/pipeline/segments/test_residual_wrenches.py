@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cgwm.pipeline.optimization.uncertainty import chi2_tail
+from cgwm.pipeline.optimization.tails import chi2_tail
 from cgwm.pipeline.segments.carried_starts import LIMITS as CARRIED
 from cgwm.pipeline.segments.carried_starts import Beginning, Step, _shape, _spread, _step
 from cgwm.pipeline.segments.contact_phases import LIMITS as PHASES
