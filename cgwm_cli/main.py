@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     with caught(owned=arguments is None):
         from .execution import run_command
 
-        run_command(_app, sys.argv[1:] if arguments is None else arguments)
+        run_command(_app, sys.argv[1:] if arguments is None else arguments, ends=arguments is None)
 
 
 def _app() -> Callable[..., Any]:

@@ -131,17 +131,18 @@ class Together:
     """Constants of each variant by their places among them."""
 
     @staticmethod
-    def of(world: World, variants: Sequence[Variant]) -> Together:
+    def of(world: World, variants: Sequence[Variant], kind: Kind = "contact") -> Together:
         """Return a world with variants: as constants have a value for each item, the fused kernel takes them at once.
 
         Args:
             world: Without them.
-            variants: Of contact effects; those of one candidate may differ in their constants.
+            variants: All of them act in the segments; those of one candidate may differ in their constants.
+            kind: Kind of the segments.
         """
         first: dict[int, Variant] = {}
         for variant in variants:
             first.setdefault(variant.place, variant)
-        everything, own = with_variants(world, list(first.values()), "contact")
+        everything, own = with_variants(world, list(first.values()), kind)
         fixed = [constant for variant in first.values() for constant in _constants(variant)]
         place = {p.name: k for k, p in enumerate((*own, *fixed))}
         columns, constants = [], []

@@ -14,7 +14,7 @@ from ..optimization.uncertainty import scaled_pinv
 from ..physics.fused.packing import reason_against
 from ..physics.parameters import Parameter
 from ..physics.world import World
-from .candidates import Variant, acts_in, base_parameters, base_values, with_variants
+from .candidates import Together, Variant, acts_in, base_parameters, base_values, with_variants
 from .segment_fit import Linear, projected
 from .segments import Segments
 
@@ -103,10 +103,14 @@ def derivatives(
     columns = {p.name: jacobian[..., k] for k, p in enumerate(base)}
     # a candidate at neutral changes nothing, so that the parts can be computed in separate worlds
     for part in _parts(variants, segments, at.world):
-        candidates_world, candidate_parameters = with_variants(world, part, segments.kind)
-        at = segments.in_world(candidates_world)
-        slopes = at.slopes(candidate_parameters, base_values(candidates_world, candidate_parameters), rows)
-        columns |= {p.name: slopes[..., k] for k, p in enumerate(candidate_parameters)}
+        together = Together.of(world, part, segments.kind)
+        values = base_values(together.world, together.parameters).repeat(len(part), 1)
+        together.set_constants(values, 0)
+        names = [name for variant in part for name in variant.parameters]
+        places = [place for own in together.columns for place in own]
+        owner = [k for k, own in enumerate(together.columns) for _ in own]
+        slopes = segments.in_world(together.world).slopes(together.parameters, values[owner], places, rows)
+        columns |= {name: slopes[..., k] for k, name in enumerate(names)}
     own = [columns[p.name][..., None] for p in parameters]
     return parameters, rows, torch.cat((*own, jacobian[..., len(base) :]), -1)
 
@@ -114,7 +118,8 @@ def derivatives(
 def _parts(variants: Sequence[Variant], segments: Segments, world: World) -> list[list[Variant]]:
     """Return candidates in parts of one batch each, because every rollout computes all effects of its world.
 
-    Candidates that the fused kernel supports are kept apart from the others, and it takes one of each type.
+    Candidates that the fused kernel supports are kept apart from the others, and it takes one of each type, with values
+    of its constants for each item.
     """
     most = max(1, PART_ROLLOUTS // len(segments.items))
     parts: list[tuple[bool, list[Variant]]] = []
@@ -130,7 +135,9 @@ def _parts(variants: Sequence[Variant], segments: Segments, world: World) -> lis
 
 def _fits(part: Sequence[Variant], variant: Variant, most: int, one_of_a_kind: bool) -> bool:
     """Return whether a part has room for one candidate more."""
-    alike = any(type(other.active.effect) is type(variant.active.effect) for other in part)
+    alike = any(
+        type(other.active.effect) is type(variant.active.effect) and other.place != variant.place for other in part
+    )
     return sum(len(v.parameters) for v in (*part, variant)) <= most and not (one_of_a_kind and alike)
 
 

@@ -193,18 +193,20 @@ class Segments:
         shifts = shifts / torch.tensor(self.noise).repeat_interleave(3).to(shifts)
         return without_time_errors(found, shifts, seen.times_s, masks, self.noise_model)
 
-    def slopes(self, parameters: Sequence[Parameter], values: Tensor, rows: Tensor) -> Tensor:
-        """Return derivatives (B, T nf, 6, P) of the residuals by parameters alone, by one-sided differences.
+    def slopes(self, parameters: Sequence[Parameter], values: Tensor, columns: Sequence[int], rows: Tensor) -> Tensor:
+        """Return derivatives (B, T nf, 6, K) of the residuals by parameters alone, by one-sided differences.
 
         Args:
-            parameters: By which.
-            values: Where, in fitted coordinates, shape (P,).
+            parameters: Parameters of the world (P).
+            values: Where each derivative is taken, in fitted coordinates, shape (K, P); all leave the same residuals.
+            columns: Place of the parameter by which each is taken (K).
             rows: The residuals there.
         """
-        steps = torch.tensor([_difference(p)[1] for p in parameters]).to(values)
-        every = self.in_states([self.observations.state] * len(parameters))
-        moved = (values + torch.diag(steps)).repeat_interleave(len(self.items), 0)
-        high = every.residuals(parameters, moved, jacobian=False)[0].unflatten(0, (len(parameters), -1))
+        steps = torch.tensor([_difference(parameters[column])[1] for column in columns]).to(values)
+        every = self.in_states([self.observations.state] * len(columns))
+        moved = values.scatter_add(1, torch.tensor(columns)[:, None].to(values.device), steps[:, None])
+        moved = moved.repeat_interleave(len(self.items), 0)
+        high = every.residuals(parameters, moved, jacobian=False)[0].unflatten(0, (len(columns), -1))
         slopes = (high - rows) / steps[:, None, None, None]
         return torch.nan_to_num(slopes, posinf=0.0, neginf=0.0).movedim(0, -1)
 

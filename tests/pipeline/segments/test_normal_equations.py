@@ -107,15 +107,16 @@ def test_episodes_are_left_out_or_taken_alone_by_their_weights() -> None:
         assert made.prior.tolist() == [1 / 4, 1 / 9, 0.0, 0.0] and made.episode.tolist() == [1, 0, 1]
 
 
-def test_candidates_share_a_batch_up_to_its_size_and_one_of_a_type() -> None:
-    def variant(name: str) -> Any:
+def test_candidates_share_a_batch_up_to_its_size_and_one_candidate_of_a_type() -> None:
+    def variant(name: str, place: int) -> Any:
         effect: Any = load_effect(name)
-        return Variant(0, SimpleNamespace(effect=effect), {})  # pyright: ignore[reportArgumentType]
+        return Variant(place, SimpleNamespace(effect=effect), {})  # pyright: ignore[reportArgumentType]
 
-    drag, wind = variant("linear_drag"), variant("wind")
+    drag, wind, other = variant("linear_drag", 0), variant("wind", 1), variant("linear_drag", 2)
     size = len(drag.parameters) + len(wind.parameters)
     assert _fits([drag], wind, size, True) and not _fits([drag], wind, size - 1, True)
-    assert not _fits([drag], variant("linear_drag"), 9, True) and _fits([drag], variant("linear_drag"), 9, False)
+    assert not _fits([drag], other, 9, True) and _fits([drag], other, 9, False)
+    assert _fits([drag], variant("linear_drag", 0), 9, True)  # the same one with another constant
     assert _fits([], drag, len(drag.parameters), True)
 
 
