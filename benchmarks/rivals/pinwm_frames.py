@@ -13,6 +13,7 @@ from cgwm.datasets.capture.cameras import Camera
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.synthetic.objects import SolidObject
+from cgwm.pipeline.demo.truth_tables import OBJECT
 from cgwm.pipeline.rendering.video_view import usable_cameras, video_view
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -23,12 +24,12 @@ Array = NDArray[np.float64]
 FINGERTIP = "fingertip"
 
 
-def seen(image: NDArray[np.uint8], mask: NDArray[np.uint8], camera: Camera, number: int) -> Any:
+def seen(image: NDArray[np.uint8], mask: NDArray[np.bool_], camera: Camera, number: int) -> Any:
     """Return a picture as its camera, which holds the picture: the object on white, without distortion.
 
     Args:
         image: Picture, RGB, uint8, shape (H, W, 3).
-        mask: Where the object is, shape (H, W).
+        mask: Where the object is, bool, shape (H, W).
         camera: Of the picture; the new one has its pose and the mean of its focal lengths.
         number: Of the picture.
     """
@@ -39,7 +40,7 @@ def seen(image: NDArray[np.uint8], mask: NDArray[np.uint8], camera: Camera, numb
     new = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     distortion = np.asarray(camera.distortion, float) if np.any(camera.distortion) else None
     maps = cv2.initUndistortRectifyMap(old, distortion, np.eye(3), new, (width, height), cv2.CV_32FC1)  # pyright: ignore[reportArgumentType, reportCallIssue]
-    alpha = cv2.remap((mask > 0).astype(np.float32), *maps, cv2.INTER_LINEAR)[..., None]
+    alpha = cv2.remap(mask.astype(np.float32), *maps, cv2.INTER_LINEAR)[..., None]
     picture = cv2.remap(image, *maps, cv2.INTER_LINEAR).astype(np.float32) / 255 * alpha + 1 - alpha
     channels = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float()
     T_cam_world = camera.T_cam_world
@@ -52,8 +53,8 @@ def seen(image: NDArray[np.uint8], mask: NDArray[np.uint8], camera: Camera, numb
 
 def photos_of(capture: Capture) -> list[Any]:
     """Return the photos of a capture as its cameras."""
-    names = capture.photos()
-    parts = [(capture.photo(name), capture.photo_mask(name), capture.photo_camera(name)) for name in names]
+    names, label = capture.photos(), _label(capture)
+    parts = [(capture.photo(name), capture.photo_mask(name) == label, capture.photo_camera(name)) for name in names]
     return [seen(*part, number) for number, part in enumerate(parts)]  # pyright: ignore[reportArgumentType]
 
 
@@ -65,8 +66,13 @@ def frames_of(capture: Capture, episode: str) -> tuple[Array, list[list[Any]]]:
         images, masks = capture.video_frames(camera, episode), capture.video_masks(camera, episode)
         numbers, size = capture.frame_numbers(camera, episode), (images.shape[2], images.shape[1])
         sights = [video_view(capture, camera, episode, int(number), size) for number in numbers]
-        views.append([seen(images[k], masks[k], sight, k) for k, sight in enumerate(sights)])  # pyright: ignore[reportOptionalSubscript]
+        views.append([seen(images[k], masks[k] == _label(capture), sight, k) for k, sight in enumerate(sights)])  # pyright: ignore[reportOptionalSubscript]
     return np.asarray(capture.frame_times(cameras[0], episode)), views
+
+
+def _label(capture: Capture) -> int:
+    """Return the object's number in the masks; the fingertip has another."""
+    return 1 + [body.name for body in capture.manifest.bodies].index(OBJECT)
 
 
 @dataclass(frozen=True, eq=False)
