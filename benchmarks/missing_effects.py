@@ -181,6 +181,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--contenders", default=",".join(CONTENDERS), help="separated by commas")
     parser.add_argument("--nulls", type=int, default=NULLS, help="for each engine")
     parser.add_argument("--each", type=int, default=EACH, help="captures of each other row")
+    parser.add_argument("--more", type=int, default=0, help="further captures of what is in no library")
     parser.add_argument("--only", default="", help="part of the name")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no capture after this time")
@@ -193,7 +194,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if given.record and (given.only or not given.stage.startswith("report")):
         parser.error("--record wants a report: --stage report..., without --only.")
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
-    chosen = [case for case in real_cases(given.stage, given.nulls, given.each) if given.only in case.name]
+    chosen = [case for case in real_cases(given.stage, given.nulls, given.each, given.more) if given.only in case.name]
     captures = given.captures or ROOT / "out" / "real_like" / given.stage
     if given.what == "export":
         if given.out is None:
@@ -237,7 +238,8 @@ def _recorded(
         print("a contender has no answer: nothing is recorded.", file=sys.stderr)
         return False
     figures: Any = import_module("missing_effects_figures")
-    each = " ".join(f"--{name} {count}" for name, count in (("each", options.each), ("nulls", options.nulls)))
+    counts = {"each": options.each, "nulls": options.nulls, "more": options.more}
+    each = " ".join(f"--{name} {count}" for name, count in counts.items() if count or name != "more")
     figures.record_figures(rows, f"python benchmarks/missing_effects.py run --stage {options.stage} {each}")
     return True
 

@@ -11,9 +11,12 @@ from cgwm.datasets.synthetic.hidden_effects import EFFECTS, KNOWN, UNKNOWN, Case
 from cgwm.datasets.synthetic.hidden_effects.protocol import Protocol
 from cgwm.datasets.synthetic.hidden_effects.things import Kind
 
+from . import invented
 from .engines import ENGINE_OF, GROUPS, can_hide
 
-Stage = Literal["development", "report1", "report2", "report3", "report4", "report5", "report6", "report7", "report8"]
+Stage = Literal[
+    "development", "report1", "report2", "report3", "report4", "report5", "report6", "report7", "report8", "report9"
+]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on `development` alone. Each report stage is read once, after everything is fixed: the first
 that was not yet run is the one to use, and what it says is never a reason to change the version that it judges."""
@@ -35,6 +38,8 @@ FAMILIES: tuple[set[str], ...] = (
 """Effects that do much the same: no pair is drawn from one of these."""
 _CENTROIDS = {"linear_drag", "quadratic_drag", "wind", "constant_force", "gravity_tilt", "gravity_scale", "buoyancy"}
 _CENTROIDS |= {"length_scale", "clock_scale", "gust", "shaking", "attractor", "heading_force", "gravity_step"}
+_CENTROIDS |= {"side_step", "fading", "height_force", "swirl", "cubic_drag", "dry_drag", "updraft"}
+_CENTROIDS |= {"jet", "low_updraft", "ramp", "drag_crisis"}
 """Effects that show without orientations; balls with these, or none, have centroids only in 3 of 10 captures."""
 
 
@@ -87,10 +92,16 @@ class RealCase:
         )
 
 
-def real_cases(stage: Stage, nulls: int = NULLS, each: int = EACH) -> list[RealCase]:
+def real_cases(stage: Stage, nulls: int = NULLS, each: int = EACH, more: int = 0) -> list[RealCase]:
     """Return the cases of a stage: nulls for each engine (MuJoCo's over its settings), and so many of each other row.
 
     A case's name, and with it the whole capture, does not depend on how many there are.
+
+    Args:
+        stage: Development or a report.
+        nulls: Captures without an effect for each engine.
+        each: Captures of each other row.
+        more: Further captures of the row unknown, with the laws of `invented`: reports before report9 had none.
 
     Raises:
         ValueError: If there is no such stage.
@@ -102,7 +113,8 @@ def real_cases(stage: Stage, nulls: int = NULLS, each: int = EACH) -> list[RealC
         engines.setdefault(ENGINE_OF[group], []).append(group)
     found = [_case(stage, "null", groups[k % len(groups)], k) for groups in engines.values() for k in range(nulls)]
     groups = list(GROUPS)
-    return found + [_case(stage, row, groups[k % len(groups)], k) for row in ROWS[1:] for k in range(each)]
+    found += [_case(stage, row, groups[k % len(groups)], k) for row in ROWS[1:] for k in range(each)]
+    return found + [_invented(stage, groups[k % len(groups)], k) for k in range(more)]
 
 
 def _case(stage: Stage, row: Row, group: str, k: int) -> RealCase:
@@ -121,6 +133,17 @@ def _case(stage: Stage, row: Row, group: str, k: int) -> RealCase:
         effects = (str(rng.choice([name for name in fit if can_hide(group, name)])),)
     name = "/".join((stem, thing, "+".join(effects))) if effects else f"{stem}/{thing}"
     return RealCase(name=name, group=group, thing=thing, effects=effects, row=row, seed=seed)
+
+
+def _invented(stage: Stage, group: str, k: int) -> RealCase:
+    """Return a case whose law is one of `invented`: those of development, or those that it lacks."""
+    stem = f"real-like/{stage}/invented/{group}/{k}"
+    seed = 2 * (crc32(stem.encode()) // 2) + (stage != "development")
+    rng = np.random.default_rng([seed, *b"plan"])
+    thing: Kind = ("cube", "ball")[int(rng.integers(2))]
+    laws = invented.DEVELOPMENT if stage == "development" else invented.UNSEEN
+    law = str(rng.choice(laws))
+    return RealCase(name=f"{stem}/{thing}/{law}", group=group, thing=thing, effects=(law,), row="unknown", seed=seed)
 
 
 def _pair(group: str, thing: Kind, rng: np.random.Generator) -> tuple[str, str]:

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cgwm.datasets.synthetic.hidden_effects import EFFECTS
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 from real_like.errors import Errors, draw_errors, noise
+from real_like.invented import DEVELOPMENT, UNSEEN
 from real_like.plan import STAGES, real_cases
 from real_like.score import judge, wilson
 
@@ -78,10 +80,19 @@ def test_every_capture_carries_something_beside_the_slow_error_and_never_both_le
 
 
 def test_seeds_of_development_and_reports_are_apart_and_do_not_depend_on_the_numbers() -> None:
-    seeds = {stage: {case.name: case.seed for case in real_cases(stage, 12, 12)} for stage in STAGES}
+    seeds = {stage: {case.name: case.seed for case in real_cases(stage, 12, 12, 12)} for stage in STAGES}
     assert all(seed % 2 == (stage != "development") for stage, own in seeds.items() for seed in own.values())
-    few = {case.name: case.seed for case in real_cases("report1", 3, 6)}
+    few = {case.name: case.seed for case in real_cases("report1", 3, 6, 5)}
     assert few.items() <= seeds["report1"].items()
+
+
+def test_reports_hide_laws_that_no_development_capture_has() -> None:
+    laws = {stage: {case.effects[0] for case in real_cases(stage, 0, 0, 60)} for stage in ("development", "report9")}
+    assert laws["development"] == set(DEVELOPMENT) and laws["report9"] == set(UNSEEN)
+    assert not laws["development"] & laws["report9"]
+    assert all(
+        case.row == "unknown" and EFFECTS[case.effects[0]].acts == "unknown" for case in real_cases("report9", 0, 0, 9)
+    )
 
 
 def test_the_generator_does_not_load_what_judges() -> None:
