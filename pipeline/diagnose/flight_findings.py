@@ -23,12 +23,12 @@ from ..segments.repeated_forces import RepeatedForce, repeated_force
 from ..segments.residual_wrench import Omnibus, ResidualWrenches, dispersion, wrench_windows
 from ..segments.segments import Segments
 from ..segments.slow_errors import SlowErrors, flight_errors, tell_errors
-from .alternative_laws import OtherLaw
 from .effect_selection import SelectionStep, repeats
 from .falsification import Consistency
 from .flight_omnibus import flight_windows, is_significant, worst_omnibus
 from .flight_search import flight_search
 from .flight_selection import FlightSelection, completed, judged, reconsidered
+from .other_forms import OtherForm
 from .own_tilt import TILTS, own_tilts
 from .thresholds import THRESHOLDS
 
@@ -57,8 +57,8 @@ class FlightFindings:
     """The same with them."""
     agreement: Consistency | None
     """Whether the effects have the same parameters in all episodes; None without effects."""
-    others: tuple[OtherLaw, ...]
-    """Alternative laws of the selected effects."""
+    others: tuple[OtherForm, ...]
+    """The best other form of each selected effect that is a force."""
     fleeting: tuple[str, ...]
     """The selected effects that are constant forces and do not act as much late in the flights as early."""
     left: RepeatedForce | None

@@ -14,7 +14,6 @@ from ..segments.prepare import Prepared
 from ..segments.segment_fit import refit
 from ..segments.segments import Segments
 from ..segments.slow_errors import SlowErrors
-from .alternative_laws import OtherLaw, other_laws
 from .coupled_effects import DRAGS
 from .cross_validation import held_out_loss
 from .effect_selection import SelectionStep
@@ -23,6 +22,7 @@ from .flight_omnibus import flight_windows, is_significant, worst_omnibus
 from .flight_search import reselected
 from .group_values import with_group_values
 from .lasting_forces import without_lasting
+from .other_forms import OtherForm, best_forms
 from .own_tilt import TILTS, own_tilt_step
 from .thresholds import THRESHOLDS
 
@@ -90,8 +90,8 @@ class JudgedSelection:
 
     selection: FlightSelection
     """The effects that are left."""
-    others: Sequence[OtherLaw] = ()
-    """Alternative laws of the effects."""
+    others: Sequence[OtherForm] = ()
+    """The best other form of each effect that is a force."""
     fleeting: frozenset[str] = frozenset()
     """The constant forces that do not act as much late in the flights as early."""
     agreement: Consistency | None = None
@@ -160,7 +160,7 @@ def judged(
     """
     if found.flight is None:
         return JudgedSelection(selection=found)
-    others = other_laws(found.flight, found.world, found.names, scatter)
+    others = best_forms(found.flight, found.world, found.names, scatter)
     fleeting = frozenset(without_lasting(found.flight, found.world, found.names, scatter))
     wrong = {one.effect for one in others if one.better} | fleeting
     if wrong and set(found.names) - wrong:

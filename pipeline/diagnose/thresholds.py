@@ -264,13 +264,11 @@ class VerdictThresholds:
         "the noise model alone",
     )
     consistent_share: float = threshold(0.9, "1", "see `consistent_p`", error_rates="see `consistent_p`")
-    better_chi2: float = threshold(
-        12.0,
+    form_chi2: float = threshold(
+        6.0,
         "chi2",
-        "an alternative law of a detected effect fits better (`unexplained`) or equally well (a note): odds of 400",
-        BY_ARGUMENT,
-        "development: a quadratic spin drag `unexplained` in 4 of 4 (named `spin_damping` in 2 of 3 before), spin "
-        "damping right in 6 of 6",
+        "another form of a named force fits better than its own law by more than this, beside the scatter between "
+        "episodes and the penalty of BIC: the effect is not named, and alone it is `unexplained`",
     )
     unlike_fall: tuple[float, float] = threshold(
         (0.5, 8.0),

@@ -12,7 +12,6 @@ from ..physics.world import World
 from ..segments.candidates import Candidate, without_effect
 from ..segments.prepare import Prepared
 from ..segments.sliding_fit import StartedSliding
-from .alternative_laws import OtherLaw
 from .contact_search import TESTS, Chosen, ContactFindings, with_contact
 from .contact_tests.contact_test import ContactTest
 from .cross_validation import held_out_errors, held_out_fall
@@ -21,6 +20,7 @@ from .effect_selection import SelectionStep
 from .evidence import Evidence
 from .flight_findings import FlightFindings, flight_findings
 from .flight_omnibus import is_significant
+from .other_forms import OtherForm
 from .remaining import bad_ones, misfits_of
 from .thresholds import THRESHOLDS
 
@@ -53,8 +53,8 @@ class Findings:
     """World without the selected effects."""
     errors: dict[str, tuple[float, float]]
     """Held-out prediction errors without and with each selected effect [m], by effect name."""
-    as_good: tuple[OtherLaw, ...] = ()
-    """Alternative laws that explain the flights as well as those of the selected effects."""
+    as_good: tuple[OtherForm, ...] = ()
+    """Other forms of the selected effects that explain the flights as well."""
     limits: tuple[DetectionLimit, ...] = ()
     """Detection limits of the contact effects, where contact selected none."""
     sliding: StartedSliding | None = None

@@ -239,7 +239,7 @@ def misfit_warnings(findings: Findings) -> list[str]:
 
 def law_warnings(findings: Findings) -> list[str]:
     """Return a warning for each effect whose motions fit another law equally well."""
-    found = [f"{law.effect}: these flights fit {law.formula} as well as its own law." for law in findings.as_good]
+    found = [f"{form.effect}: these flights fit the same force {form.words} as well." for form in findings.as_good]
     return found + [
         f"{name}: not named, since the slides fit a friction limited along each of two axes by itself as well, as "
         "engines with a friction pyramid have it and no surface does. Next, where they were measured on a surface, "

@@ -1,0 +1,195 @@
+"""Force laws of no library that a named effect may imitate, fitted in its stead to the flights that showed it.
+
+A name is right only if the force has the law of that name. A gust, a force that sets in late, one that acts on one side
+of the room, or a damping by another power of the spin is followed by the nearest effect of the library, too, and few
+flights need not show what is left. The force that is named is therefore compared with other forms of it: the same one
+during a part of the flights, on one side of a place, above a height, by another power of speed or spin. A force is
+compared with springs, whirls and the like besides. Each takes the place of the effect, in flights linearised at their
+fit, with the states and the other effects fitted again.
+
+No model of errors is exact, and how the numbers of a form scatter from episode to episode tells how far it can be
+believed beside that form (`falsification`): a difference of chi2 counts in units of that scatter.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..physics.effects.effect import ActiveEffect
+from ..physics.world import World
+from ..segments.candidates import base_parameters, base_values
+from ..segments.force_fields import FlownMotion, ForceField
+from ..segments.segment_fit import projected
+from ..segments.segments import Segments
+from .form_families import forms_of, own_field
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.verdict
+
+Array = NDArray[np.float64]
+
+LEAST_SHARE = 1e-3
+"""Share of the information of all episodes from which one episode tells a direction of a form's numbers."""
+SINGULAR = 1e-7
+"""The same of the largest information, below which a direction is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OtherForm:
+    """A form of a named force, in its place."""
+
+    effect: str
+    """Name of the effect."""
+    words: str
+    """The form in words, to follow "the same force"."""
+    gain: float
+    """Fall of chi2 with it in place of the effect, beside the scatter between episodes, less the penalty of BIC."""
+
+    @property
+    def better(self) -> bool:
+        """Whether the form explains the flights clearly better."""
+        return self.gain > LIMITS.form_chi2
+
+    @property
+    def as_good(self) -> bool:
+        """Whether the form explains the flights as well, and not clearly better."""
+        return 0 < self.gain <= LIMITS.form_chi2
+
+
+def best_forms(flight: Segments, world: World, names: Sequence[str], dispersion: float) -> list[OtherForm]:
+    """Return for each named effect that is a force the form that explains the flights best in its place.
+
+    Args:
+        flight: Segments with states fitted by the world.
+        world: The world with the effects at their fitted parameters.
+        names: Names of the effects.
+        dispersion: Factor by which variances exceed those of the noise.
+    """
+    flight = flight.in_world(world)
+    motion = FlownMotion(flight)
+    found = []
+    for active in world.effects:
+        own = own_field(motion, active) if active.effect.name in names else None
+        if own is not None:
+            found.append(_best(motion, active, {"": own, **forms_of(motion, own)}, dispersion))
+    return found
+
+
+def _best(motion: FlownMotion, active: ActiveEffect, forms: dict[str, ForceField], dispersion: float) -> OtherForm:
+    """Return the form of an effect, whose own force is the first, that explains the flights best.
+
+    Falls count against that of the own force, linear as the forms are, not against that of the fitted effect.
+    """
+    fit = _Fit.of(motion, active.effect.name, list(forms.values()))
+    size, count = len(fit.own), max(float(motion.flight.dof.sum()), 2.0)
+    as_it_is, gains = fit.in_its_stead(fit.forms[0], dispersion)[0], {}
+    for words, columns in zip(list(forms)[1:], fit.forms[1:], strict=True):
+        fall, scatter = fit.in_its_stead(columns, dispersion)
+        gains[words] = (fall - as_it_is) / scatter - (len(columns) - size) * math.log(count)
+    best = max(gains, key=lambda one: gains[one])
+    return OtherForm(effect=active.effect.name, words=best, gain=gains[best])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Fit:
+    """Quadratic cost of episodes (E) in parameters and forms (n), at the fit of an effect, states eliminated."""
+
+    information: Array
+    """Information of each episode, shape (E, n, n)."""
+    score: Array
+    """Score of each episode, shape (E, n)."""
+    prior: Array
+    """Prior information, of the other parameters alone, shape (n,)."""
+    values: Array
+    """Values of the effect's parameters at the fit, 0 elsewhere, shape (n,)."""
+    own: list[int]
+    """Places of the effect's parameters."""
+    rest: list[int]
+    """Places of the other parameters."""
+    forms: list[list[int]]
+    """Places of the numbers of each form."""
+
+    @staticmethod
+    def of(motion: FlownMotion, name: str, forms: Sequence[ForceField]) -> _Fit:
+        """Return the cost of flights in the parameters of their world and in forms of an effect."""
+        flight = motion.flight
+        parameters = base_parameters(flight.world, "flight")
+        values = base_values(flight.world, parameters)
+        rows, jacobian = flight.residuals(parameters, values)
+        count = len(parameters)
+        sizes = np.cumsum([count, *(form.size for form in forms)])
+        columns = motion.innovations(ForceField.joined(forms)).to(jacobian)
+        joined = torch.cat((jacobian[..., :count], columns, jacobian[..., count:]), -1)
+        linear = projected(flight, rows, joined, int(sizes[-1]))
+        own = [k for k, p in enumerate(parameters) if p.name.partition(".")[0] == name]
+        rest = [k for k in range(count) if k not in own]
+        episode = np.unique([item.episode for item in flight.items], return_inverse=True)[1]
+        information = np.zeros((episode.max() + 1, *linear.information.shape[1:]))
+        score = np.zeros(information.shape[:2])
+        np.add.at(information, episode, linear.information.double().numpy())
+        np.add.at(score, episode, linear.score.double().numpy())
+        return _Fit(
+            information=information,
+            score=score,
+            prior=_placed(rest, [1 / parameters[k].prior[1] ** 2 for k in rest], len(score[0])),
+            values=_placed(own, values[own].tolist(), len(score[0])),
+            own=own,
+            rest=rest,
+            forms=[list(range(a, b)) for a, b in itertools.pairwise(sizes.tolist())],
+        )
+
+    def in_its_stead(self, form: Sequence[int], dispersion: float) -> tuple[float, float]:
+        """Return the fall of chi2 with a form in place of the effect, and the scatter of the form between episodes."""
+        with_effect = self._solved([*self.rest, *self.own], np.zeros_like(self.values))
+        with_form = self._solved([*self.rest, *form], -self.values)
+        slopes = self.score - self.information @ with_form
+        q, dof = _scatter(self.information[:, form][:, :, form], slopes[:, form])
+        scatter = (LIMITS.model_counts + q / dispersion) / (LIMITS.model_counts + dof)
+        return (self._cost(with_effect) - self._cost(with_form)) / dispersion, max(1.0, scatter)
+
+    def _cost(self, step: Array) -> float:
+        """Return the cost of a step (n,) from the fit, up to a constant."""
+        return float(step @ (self.information.sum(0) @ step) - 2 * self.score.sum(0) @ step)
+
+    def _solved(self, free: Sequence[int], fixed: Array) -> Array:
+        """Return the step (n,) of least cost in free places, from fixed ones."""
+        places = list(free)
+        total = self.information.sum(0)
+        matrix = total[np.ix_(places, places)] + np.diag(self.prior[places])
+        step = fixed.copy()
+        step[places] += _inverse(matrix) @ (self.score.sum(0) - total @ fixed)[places]
+        return step
+
+
+def _placed(places: Sequence[int], values: Sequence[float], size: int) -> Array:
+    """Return values at places of a vector of zeros."""
+    found = np.zeros(size)
+    found[list(places)] = values
+    return found
+
+
+def _scatter(information: Array, slopes: Array) -> tuple[float, int]:
+    """Return Cochran's Q of numbers over episodes from their information (E, k, k) and slopes (E, k), and its dof."""
+    size = np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
+    q, rank = 0.0, 0
+    for matrix, slope in zip(information, slopes, strict=True):
+        values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+        kept = values > LEAST_SHARE
+        along = vectors[:, kept].T @ (slope / size)
+        q, rank = q + float((along**2 / values[kept]).sum()), rank + int(kept.sum())
+    return q, max(rank - len(size), 0)
+
+
+def _inverse(matrix: Array) -> Array:
+    """Return the inverse of an information matrix in its measured directions."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+    kept = values > SINGULAR
+    return (vectors[:, kept] / values[kept]) @ vectors[:, kept].T / np.outer(size, size)
