@@ -39,8 +39,10 @@ def own_field(motion: FlownMotion, active: ActiveEffect) -> ForceField | None:
 
 
 def forms_of(motion: FlownMotion, own: ForceField) -> dict[str, ForceField]:
-    """Return the forms of a force, in words that follow "the same force"."""
-    found = {words: own.times(factor) for words, factor in (*_when(motion), *_where(motion), *_how_fast(motion))}
+    """Return the forms of a force, by a description in words."""
+    same = "the same torque" if bool(own.turning.any()) else "the same force"
+    factors = (*_when(motion), *_where(motion), *_how_fast(motion))
+    found = {f"{same} {words}": own.times(factor) for words, factor in factors}
     # what turns the body is compared with itself alone: a torque of another direction is no form of it
     return found if bool(own.turning.any()) else {**found, **_elsewhere(motion)}
 
@@ -101,17 +103,19 @@ def _elsewhere(motion: FlownMotion) -> dict[str, ForceField]:
     angle = 2 * torch.atan2(*reversed((velocity @ level).unbind(-1)))[..., None]
     lift = torch.linalg.cross(spin, velocity)
     found = {
-        "as of a spring to a vertical line": ForceField.joined([_along(-level_place), steady]),
-        "as of a whirl about a vertical line": ForceField.joined(
+        "a force as of a spring to a vertical line": ForceField.joined([_along(-level_place), steady]),
+        "a force as of a whirl about a vertical line": ForceField.joined(
             [_along(torch.linalg.cross(upward, level_place)), steady]
         ),
-        "across the path, by its heading": ForceField.joined([_along(left * angle.cos()), _along(left * angle.sin())]),
-        "across the path": _along(left),
-        "against the motion, the same at all speeds": _along(-velocity / speed.clamp_min(SLOW_M_S)),
-        "against the motion, by the cube of the speed": _along(-velocity * speed.square()),
-        "upwards, by the square of the level speed": _along(upward * level_speed.square()),
-        "across spin and velocity, by the square of the spin": _along(lift * spin.norm(dim=-1, keepdim=True)),
-        "along the spin": _along(spin),
+        "a force across the path, by its heading": ForceField.joined(
+            [_along(left * angle.cos()), _along(left * angle.sin())]
+        ),
+        "a force across the path": _along(left),
+        "a force against the motion, the same at all speeds": _along(-velocity / speed.clamp_min(SLOW_M_S)),
+        "a force against the motion, by the cube of the speed": _along(-velocity * speed.square()),
+        "a force upwards, by the square of the level speed": _along(upward * level_speed.square()),
+        "a force across spin and velocity, by the square of the spin": _along(lift * spin.norm(dim=-1, keepdim=True)),
+        "a force along the spin": _along(spin),
     }
     return {words: field for words, field in found.items() if bool(field.acceleration.any())}
 

@@ -48,7 +48,7 @@ class OtherForm:
     effect: str
     """Name of the effect."""
     words: str
-    """The form in words, to follow "the same force"."""
+    """The form in words."""
     gain: float
     """Fall of chi2 with it in place of the effect, beside the scatter between episodes, less the penalty of BIC."""
 

@@ -58,13 +58,20 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         if findings.flight.untold:
             return _UNTOLD
         where = f" {organised(law.where)}" if law is not None else ""
-        return f"Something is missing in flight, and none of the candidates explains it.{where}{_own(findings)}"
+        none = f"Something is missing in flight, and none of the candidates explains it.{_nearest(findings)}"
+        return f"{none}{where}{_own(findings)}"
     words = []
     for one in findings.chosen:
         others = [e.candidate.spec for e in one.equals[1:]]
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
     named = listed([word or name for word, name in zip(words, names, strict=True)])
     return f"{_called(findings)}: {named}.{_apart(findings)}{_rest(findings, law)}"
+
+
+def _nearest(findings: Findings) -> str:
+    """Return which effects come near, and in what other form the flights fit them better; empty for none."""
+    forms = [form for form in findings.flight.others if form.better]
+    return "".join(f" Nearest is {form.effect}, but the flights fit {form.words} better." for form in forms)
 
 
 def _called(findings: Findings) -> str:
@@ -239,7 +246,7 @@ def misfit_warnings(findings: Findings) -> list[str]:
 
 def law_warnings(findings: Findings) -> list[str]:
     """Return a warning for each effect whose motions fit another law equally well."""
-    found = [f"{form.effect}: these flights fit the same force {form.words} as well." for form in findings.as_good]
+    found = [f"{form.effect}: these flights fit {form.words} as well." for form in findings.as_good]
     return found + [
         f"{name}: not named, since the slides fit a friction limited along each of two axes by itself as well, as "
         "engines with a friction pyramid have it and no surface does. Next, where they were measured on a surface, "

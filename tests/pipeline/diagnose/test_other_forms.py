@@ -39,7 +39,7 @@ def late(track: Track) -> Track:
 
 def form_of(truth: World, named: str, late_push: bool = False) -> OtherForm:
     """Return the best form of an effect that is fitted to tosses of another world."""
-    episodes = tosses(truth, 3, 6, 0.4, 148.0, NOISE, (0.9, 1.2))
+    episodes = tosses(truth, 3, 4, 0.4, 60.0, NOISE, (0.9, 1.2))
     if late_push:
         episodes = [(name, {body: late(track) for body, track in tracks.items()}) for name, tracks in episodes]
     plain = replace(truth, effects=())
@@ -67,11 +67,11 @@ def test_a_damping_by_the_square_of_the_spin_is_no_spin_damping() -> None:
     ball = world_with("ball")
     damped = replace(ball, effects=(ActiveEffect.of(SpinDampingBySquare(), {"q": 0.05}, ball.gravity[0, :1]),))
     found = form_of(damped, "spin_damping")
-    assert found.better and found.words == "times the spin to the power 1"
+    assert found.better and found.words == "the same torque times the spin to the power 1"
 
 
 def test_what_is_no_force_has_no_other_form() -> None:
     world = world_with("cube")
     named = replace(world, effects=(ActiveEffect.of(load_effect("com_offset"), {}, world.gravity[0, :1]),))
-    prepared = prepare(world, tosses(world, 3, 3, 0.3, 148.0, NOISE, (0.9, 1.2)), NOISE)
+    prepared = prepare(world, tosses(world, 3, 3, 0.3, 60.0, NOISE, (0.9, 1.2)), NOISE)
     assert prepared.flight is not None and best_forms(prepared.flight, named, ["com_offset"], 1.0) == []
