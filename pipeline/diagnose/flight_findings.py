@@ -28,7 +28,7 @@ from .falsification import Consistency
 from .flight_omnibus import flight_windows, is_significant, worst_omnibus
 from .flight_search import flight_search
 from .flight_selection import FlightSelection, completed, judged, reconsidered
-from .other_forms import OtherForm
+from .other_forms import OtherForms
 from .own_tilt import TILTS, own_tilts
 from .thresholds import THRESHOLDS
 
@@ -57,8 +57,8 @@ class FlightFindings:
     """The same with them."""
     agreement: Consistency | None
     """Whether the effects have the same parameters in all episodes; None without effects."""
-    others: tuple[OtherForm, ...]
-    """The best other form of each selected effect that is a force."""
+    others: tuple[OtherForms, ...]
+    """Other forms of each selected effect that is a force."""
     fleeting: tuple[str, ...]
     """The selected effects that are constant forces and do not act as much late in the flights as early."""
     left: RepeatedForce | None
@@ -132,7 +132,7 @@ class FlightFindings:
         most = bool(self.in_flight) and self.explained_share >= LIMITS.enough_share
         steady = self.predicts and self.agreement is not None and self.agreement.share >= LIMITS.consistent_share
         follows = self.own_law is not None and not (most or steady)
-        other = bool(self.fleeting) or any(one.better for one in self.others)
+        other = bool(self.fleeting) or any(one.likelier for one in self.others)
         useless = bool(self.in_flight) and is_significant(self.after) and self.explained_share <= 0
         return inconsistent or imitated or follows or other or useless
 

@@ -22,7 +22,9 @@ from .flight_omnibus import flight_windows, is_significant, worst_omnibus
 from .flight_search import reselected
 from .group_values import with_group_values
 from .lasting_forces import without_lasting
-from .other_forms import OtherForm, best_forms
+from .levelling import TILTS as TILTED
+from .levelling import common_tilt_p
+from .other_forms import OtherForms, other_forms
 from .own_tilt import TILTS, own_tilt_step
 from .thresholds import THRESHOLDS
 
@@ -43,6 +45,12 @@ class FlightSelection(NamedTuple):
     def names(self) -> list[str]:
         """Names of the selected effects with one value for all episodes."""
         return [step.best.name for step in self.steps if step.flagged and step.own_std is None]
+
+    @property
+    def classes(self) -> list[tuple[str, ...]]:
+        """Names of each of these effects and of its equals, its own the first."""
+        shared = [step for step in self.steps if step.flagged and step.own_std is None]
+        return [tuple(one.name for one in step.equals) for step in shared]
 
     def with_scatter(self, groups: Sequence[int], scatter: float) -> FlightSelection:
         """Give the numbers of the effects standard errors that hold the scatter between episodes."""
@@ -69,7 +77,13 @@ class FlightSelection(NamedTuple):
             idle = name in found.names and (not step.best.is_number or _adds_nothing(found, name))
             if idle and not _carrying(found, name):
                 found = found.without({name})
-        return found if found.steps or not self.steps else found._replace(steps=[replace(self.steps[0], flagged=False)])
+        return found.or_none_of(self)
+
+    def or_none_of(self, before: FlightSelection) -> FlightSelection:
+        """Return the selection; where none is left, with the first step of one before it, as one that selected none."""
+        if self.steps or not before.steps:
+            return self
+        return self._replace(steps=[replace(before.steps[0], flagged=False)])
 
     def bic(self, scatter: float) -> float:
         """Return BIC, up to a constant of the flights; infinite without flight.
@@ -90,8 +104,8 @@ class JudgedSelection:
 
     selection: FlightSelection
     """The effects that are left."""
-    others: Sequence[OtherForm] = ()
-    """The best other form of each effect that is a force."""
+    others: Sequence[OtherForms] = ()
+    """Other forms of each effect that is a force."""
     fleeting: frozenset[str] = frozenset()
     """The constant forces that do not act as much late in the flights as early."""
     agreement: Consistency | None = None
@@ -160,16 +174,32 @@ def judged(
     """
     if found.flight is None:
         return JudgedSelection(selection=found)
-    others = best_forms(found.flight, found.world, found.names, scatter)
+    others = other_forms(found.flight, found.world, found.classes, scatter)
     fleeting = frozenset(without_lasting(found.flight, found.world, found.names, scatter))
-    wrong = {one.effect for one in others if one.better} | fleeting
+    wrong = {one.effect for one in others if one.likelier} | fleeting
     if wrong and set(found.names) - wrong:
         found = found.without(wrong)
+    found = _without_levelling(prepared, found, scatter)
     agreement = _agreement(prepared, found, found.names, scatter)
     if slow is not None and agreement is not None and (agreement.doubtful or followed):
         found = _without_contradicted(prepared, found, scatter, followed)
         agreement = _agreement(prepared, found, found.names, scatter)
     return JudgedSelection(selection=found, others=others, fleeting=fleeting, agreement=agreement)
+
+
+def _without_levelling(prepared: Prepared, found: FlightSelection, scatter: float) -> FlightSelection:
+    """Leave out effects of which flights do not tell a tilt that is no more than errors of levelling."""
+    left = found
+    for step in found.steps:
+        named = {one.name for one in step.equals}
+        if step.best.name not in left.names or not named & set(TILTED) or _carrying(left, step.best.name):
+            continue
+        other = left.without({step.best.name})
+        if other.flight is not None:
+            level = THRESHOLDS.flight.repeated_alpha / max(1, len(step.evidence))
+            if common_tilt_p(other.flight, other.world, prepared.groups, scatter) > level:
+                left = other
+    return left.or_none_of(found)
 
 
 def _agreement(prepared: Prepared, found: FlightSelection, names: Sequence[str], scatter: float) -> Consistency | None:

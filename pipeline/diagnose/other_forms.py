@@ -3,12 +3,13 @@
 A name is right only if the force has the law of that name. A gust, a force that sets in late, one that acts on one side
 of the room, or a damping by another power of the spin is followed by the nearest effect of the library, too, and few
 flights need not show what is left. The force that is named is therefore compared with other forms of it: the same one
-during a part of the flights, on one side of a place, above a height, by another power of speed or spin. A force is
-compared with springs, whirls and the like besides. Each takes the place of the effect, in flights linearised at their
-fit, with the states and the other effects fitted again.
+during a part of the flights, above a height, on one side of a place, by another power of speed or spin. Each takes its
+place in flights linearised at their fit, with the states and the other effects fitted again, and has as many numbers.
 
-No model of errors is exact, and how the numbers of a form scatter from episode to episode tells how far it can be
-believed beside that form (`falsification`): a difference of chi2 counts in units of that scatter.
+Before the data, no form of a family is likelier than another, no family likelier than another, and all together are as
+likely as the law that is named; the odds are those of the mean likelihoods. No model of errors is exact, and how the
+numbers of a form scatter from episode to episode tells how far it can be believed beside that form (`falsification`):
+a difference of chi2 counts in units of that scatter.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ..segments.candidates import base_parameters, base_values
 from ..segments.force_fields import FlownMotion, ForceField
 from ..segments.segment_fit import projected
 from ..segments.segments import Segments
-from .form_families import forms_of, own_field
+from .form_families import Family, families_of, own_field
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -42,59 +43,69 @@ SINGULAR = 1e-7
 
 
 @dataclass(frozen=True, kw_only=True)
-class OtherForm:
-    """A form of a named force, in its place."""
+class OtherForms:
+    """Other forms of a named force, in its place."""
 
     effect: str
     """Name of the effect."""
     words: str
-    """The form in words."""
+    """The form that explains the flights best, in words."""
     gain: float
-    """Fall of chi2 with it in place of the effect, beside the scatter between episodes, less the penalty of BIC."""
+    """Fall of chi2 with that form in place of the effect, beside the scatter between episodes."""
+    odds: float
+    """Twice the logarithm of the odds of all forms against the effect's own law."""
 
     @property
-    def better(self) -> bool:
-        """Whether the form explains the flights clearly better."""
-        return self.gain > LIMITS.form_chi2
+    def likelier(self) -> bool:
+        """Whether the force has another form than that of the effect, rather than that one."""
+        return self.odds > LIMITS.form_odds
 
     @property
     def as_good(self) -> bool:
-        """Whether the form explains the flights as well, and not clearly better."""
-        return 0 < self.gain <= LIMITS.form_chi2
+        """Whether one form explains the flights as well as the effect, which is likelier all the same."""
+        return not self.likelier and self.gain > 0
 
 
-def best_forms(flight: Segments, world: World, names: Sequence[str], dispersion: float) -> list[OtherForm]:
-    """Return for each named effect that is a force the form that explains the flights best in its place.
+def other_forms(
+    flight: Segments, world: World, classes: Sequence[tuple[str, ...]], dispersion: float
+) -> list[OtherForms]:
+    """Compare each named effect that is a force with its other forms.
 
     Args:
         flight: Segments with states fitted by the world.
         world: The world with the effects at their fitted parameters.
-        names: Names of the effects.
+        classes: Names of each effect and of its equals, its own the first.
         dispersion: Factor by which variances exceed those of the noise.
     """
-    flight = flight.in_world(world)
-    motion = FlownMotion(flight)
-    found = []
-    for active in world.effects:
-        own = own_field(motion, active) if active.effect.name in names else None
+    motion, found = FlownMotion(flight.in_world(world)), []
+    shared = [one for one in world.effects if all(p.shared == "all" for p in one.effect.parameters)]
+    active = {one.effect.name: one for one in shared}
+    for named in classes:
+        own = own_field(motion, active[named[0]]) if named[0] in active else None
         if own is not None:
-            found.append(_best(motion, active, {"": own, **forms_of(motion, own)}, dispersion))
+            found.append(_compared(motion, active[named[0]], own, families_of(motion, own, named), dispersion))
     return found
 
 
-def _best(motion: FlownMotion, active: ActiveEffect, forms: dict[str, ForceField], dispersion: float) -> OtherForm:
-    """Return the form of an effect, whose own force is the first, that explains the flights best.
-
-    Falls count against that of the own force, linear as the forms are, not against that of the fitted effect.
-    """
-    fit = _Fit.of(motion, active.effect.name, list(forms.values()))
-    size, count = len(fit.own), max(float(motion.flight.dof.sum()), 2.0)
-    as_it_is, gains = fit.in_its_stead(fit.forms[0], dispersion)[0], {}
-    for words, columns in zip(list(forms)[1:], fit.forms[1:], strict=True):
-        fall, scatter = fit.in_its_stead(columns, dispersion)
-        gains[words] = (fall - as_it_is) / scatter - (len(columns) - size) * math.log(count)
+def _compared(
+    motion: FlownMotion, active: ActiveEffect, own: ForceField, families: Sequence[Family], dispersion: float
+) -> OtherForms:
+    """Compare an effect, whose force is given, with families of other forms."""
+    forms = {words: field for family in families for words, field in family.items()}
+    fit = _Fit.of(motion, active, [own, *forms.values()])
+    as_it_is = fit.in_its_stead(fit.forms[0], dispersion)[0]
+    gains = {}
+    for words, columns in zip(forms, fit.forms[1:], strict=True):
+        chi2, scatter = fit.in_its_stead(columns, dispersion)
+        gains[words] = (as_it_is - chi2) / scatter
     best = max(gains, key=lambda one: gains[one])
-    return OtherForm(effect=active.effect.name, words=best, gain=gains[best])
+    halves = [_log_mean([0.5 * gains[words] for words in family]) for family in families]
+    return OtherForms(effect=active.effect.name, words=best, gain=gains[best], odds=2 * _log_mean(halves))
+
+
+def _log_mean(values: Sequence[float]) -> float:
+    """Return the logarithm of the mean of exponentials."""
+    return float(np.logaddexp.reduce(values)) - math.log(len(values))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -107,19 +118,21 @@ class _Fit:
     """Score of each episode, shape (E, n)."""
     prior: Array
     """Prior information, of the other parameters alone, shape (n,)."""
-    values: Array
-    """Values of the effect's parameters at the fit, 0 elsewhere, shape (n,)."""
-    own: list[int]
-    """Places of the effect's parameters."""
+    without: Array
+    """Step (n,) that takes the effect away."""
     rest: list[int]
     """Places of the other parameters."""
     forms: list[list[int]]
     """Places of the numbers of each form."""
 
     @staticmethod
-    def of(motion: FlownMotion, name: str, forms: Sequence[ForceField]) -> _Fit:
-        """Return the cost of flights in the parameters of their world and in forms of an effect."""
-        flight = motion.flight
+    def of(motion: FlownMotion, active: ActiveEffect, forms: Sequence[ForceField]) -> _Fit:
+        """Return the cost of flights in the parameters of their world and in forms of an effect, its own first.
+
+        Without a force, a body moves as with it less what the force does along the motion as it was: that is exact,
+        where the derivative by its parameter also has what the force does to its own change of the motion.
+        """
+        flight, name = motion.flight, active.effect.name
         parameters = base_parameters(flight.world, "flight")
         values = base_values(flight.world, parameters)
         rows, jacobian = flight.residuals(parameters, values)
@@ -129,6 +142,7 @@ class _Fit:
         joined = torch.cat((jacobian[..., :count], columns, jacobian[..., count:]), -1)
         linear = projected(flight, rows, joined, int(sizes[-1]))
         own = [k for k, p in enumerate(parameters) if p.name.partition(".")[0] == name]
+        first = list(range(count, count + len(own)))
         rest = [k for k in range(count) if k not in own]
         episode = np.unique([item.episode for item in flight.items], return_inverse=True)[1]
         information = np.zeros((episode.max() + 1, *linear.information.shape[1:]))
@@ -139,20 +153,20 @@ class _Fit:
             information=information,
             score=score,
             prior=_placed(rest, [1 / parameters[k].prior[1] ** 2 for k in rest], len(score[0])),
-            values=_placed(own, values[own].tolist(), len(score[0])),
-            own=own,
+            without=_placed(
+                first if active.effect.has("wrench") else own, [-float(values[k]) for k in own], len(score[0])
+            ),
             rest=rest,
             forms=[list(range(a, b)) for a, b in itertools.pairwise(sizes.tolist())],
         )
 
     def in_its_stead(self, form: Sequence[int], dispersion: float) -> tuple[float, float]:
-        """Return the fall of chi2 with a form in place of the effect, and the scatter of the form between episodes."""
-        with_effect = self._solved([*self.rest, *self.own], np.zeros_like(self.values))
-        with_form = self._solved([*self.rest, *form], -self.values)
-        slopes = self.score - self.information @ with_form
+        """Return chi2 with a form in place of the effect, up to a constant, and its scatter between episodes."""
+        step = self._solved([*self.rest, *form], self.without)
+        slopes = self.score - self.information @ step
         q, dof = _scatter(self.information[:, form][:, :, form], slopes[:, form])
         scatter = (LIMITS.model_counts + q / dispersion) / (LIMITS.model_counts + dof)
-        return (self._cost(with_effect) - self._cost(with_form)) / dispersion, max(1.0, scatter)
+        return self._cost(step) / dispersion, max(1.0, scatter)
 
     def _cost(self, step: Array) -> float:
         """Return the cost of a step (n,) from the fit, up to a constant."""

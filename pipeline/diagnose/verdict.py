@@ -20,7 +20,7 @@ from .effect_selection import SelectionStep
 from .evidence import Evidence
 from .flight_findings import FlightFindings, flight_findings
 from .flight_omnibus import is_significant
-from .other_forms import OtherForm
+from .other_forms import OtherForms
 from .remaining import bad_ones, misfits_of
 from .thresholds import THRESHOLDS
 
@@ -53,7 +53,7 @@ class Findings:
     """World without the selected effects."""
     errors: dict[str, tuple[float, float]]
     """Held-out prediction errors without and with each selected effect [m], by effect name."""
-    as_good: tuple[OtherForm, ...] = ()
+    as_good: tuple[OtherForms, ...] = ()
     """Other forms of the selected effects that explain the flights as well."""
     limits: tuple[DetectionLimit, ...] = ()
     """Detection limits of the contact effects, where contact selected none."""

@@ -70,7 +70,7 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
 
 def _nearest(findings: Findings) -> str:
     """Return which effects come near, and in what other form the flights fit them better; empty for none."""
-    forms = [form for form in findings.flight.others if form.better]
+    forms = [form for form in findings.flight.others if form.likelier]
     return "".join(f" Nearest is {form.effect}, but the flights fit {form.words} better." for form in forms)
 
 

@@ -127,9 +127,9 @@ class FlownMotion:
         first = first / first.norm()
         return up[:, None], torch.stack((first, torch.linalg.cross(up, first)), 1)
 
-    def quantile(self, values: Tensor, share: float) -> float:
-        """Return a quantile of values (B, T) over all frames of flight."""
-        return float(torch.quantile(values[self.inside], share))
+    def median(self, values: Tensor) -> float:
+        """Return the median of values (B, T) over all frames of flight."""
+        return float(values[self.inside].median())
 
     def field_of(self, active: ActiveEffect) -> ForceField | None:
         """Return the field of an effect with a wrench, by its parameters; None for any other effect."""
@@ -150,10 +150,10 @@ class FlownMotion:
         return ForceField.joined(fields) if fields else None
 
     def _as_seen_by_effects(self) -> BodyMotion:
-        """Return the motion of all frames as effects receive it, flattened to (B T)."""
+        """Return the motion of all frames as effects receive it, in the air as it flows, flattened to (B T)."""
         world, count = self.flight.world, self.times_s.numel()
         rotation, up = self.rotation.reshape(count, 3, 3), world.up.double()
-        return BodyMotion(
+        motion = BodyMotion(
             body=self.body,
             mass=self.body.mass[:1].expand(count),
             inertia=rotation @ self.body.inertia[:1] @ rotation.transpose(-1, -2),
@@ -165,6 +165,11 @@ class FlownMotion:
             normal=up[:1] if world.ground_normal is None else world.ground_normal[None].double(),
             ground_offset=None if world.ground_offset is None else world.ground_offset[:1].double(),
         )
+        for active in world.effects:
+            if active.effect.has("flow"):
+                flow = active.effect.flow({key: value[:1].double() for key, value in active.values.items()}, motion)
+                motion = replace(motion, air=flow if motion.air is None else motion.air + flow)
+        return motion
 
     def innovations(self, field: ForceField) -> Tensor:
         """Return the change of the flights' innovations (B, F, 6, K), in sigmas, by the numbers of a field."""

@@ -46,6 +46,11 @@ TABLE = {f"{group}.{one.name}": one for group, some in thresholds_page.groups().
 """Thresholds of a diagnosis, by group.field."""
 NUMERICS = {
     "alternative_laws.FLATTEST": "keeps an ellipse from degenerating",
+    "form_families.USUAL_FLIGHT": "grid of forms that are averaged over",
+    "form_families.SHARES": "grid of forms that are averaged over",
+    "form_families.POWERS": "grid of forms that are averaged over",
+    "other_forms.LEAST_SHARE": "keeps a matrix solvable",
+    "other_forms.SINGULAR": "keeps a matrix solvable",
     "evidence.NEARLY": "rounding of a value at its bound",
     "session_scales.LEAST_SPREAD": "keeps a matrix solvable",
     "contact_information.LEAST_STEP_S": "resolution of simulated motions",

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.diagnose.other_forms import OtherForm, best_forms
+from cgwm.pipeline.diagnose.other_forms import OtherForms, other_forms
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.effect import BodyMotion, Effect, EffectParameter, Values, Wrench
 from cgwm.pipeline.physics.world import World
@@ -37,8 +37,8 @@ def late(track: Track) -> Track:
     return replace(track, position_m=track.position_m + 0.5 * since[:, None] ** 2 * np.array([0.0, 0.0, 1.0]))
 
 
-def form_of(truth: World, named: str, late_push: bool = False) -> OtherForm:
-    """Return the best form of an effect that is fitted to tosses of another world."""
+def form_of(truth: World, named: str, late_push: bool = False) -> OtherForms:
+    """Return the other forms of an effect that is fitted to tosses of another world."""
     episodes = tosses(truth, 3, 4, 0.4, 60.0, NOISE, (0.9, 1.2))
     if late_push:
         episodes = [(name, {body: late(track) for body, track in tracks.items()}) for name, tracks in episodes]
@@ -47,31 +47,31 @@ def form_of(truth: World, named: str, late_push: bool = False) -> OtherForm:
     assert prepared.flight is not None
     world = replace(plain, effects=(ActiveEffect.of(load_effect(named), {}, plain.gravity[0, :1]),))
     fitted = refit([prepared.flight], world, base_parameters(world, "flight"))
-    (found,) = best_forms(fitted.segments[0], fitted.world, [named], 1.0)
+    (found,) = other_forms(fitted.segments[0], fitted.world, [(named,)], 1.0)
     return found
 
 
 @pytest.mark.parametrize(
     ("name", "values"), [("spin_damping", {"d": 0.5}), ("gravity_scale", {"s": 0.03}), ("linear_drag", {"c": 0.3})]
 )
-def test_the_law_of_a_true_effect_is_not_bettered(name: str, values: dict[str, float]) -> None:
-    assert not form_of(world_with("ball", {name: values}), name).better
+def test_the_law_of_a_true_effect_is_likelier_than_its_forms(name: str, values: dict[str, float]) -> None:
+    assert not form_of(world_with("ball", {name: values}), name).likelier
 
 
 def test_a_force_that_sets_in_late_is_no_other_gravity() -> None:
     found = form_of(world_with("ball"), "gravity_scale", late_push=True)
-    assert found.better and "flight" in found.words
+    assert found.likelier and "flight" in found.words
 
 
 def test_a_damping_by_the_square_of_the_spin_is_no_spin_damping() -> None:
     ball = world_with("ball")
     damped = replace(ball, effects=(ActiveEffect.of(SpinDampingBySquare(), {"q": 0.05}, ball.gravity[0, :1]),))
     found = form_of(damped, "spin_damping")
-    assert found.better and found.words == "the same torque times the spin to the power 1"
+    assert found.likelier and found.words == "the same torque times the spin to the power 1"
 
 
 def test_what_is_no_force_has_no_other_form() -> None:
     world = world_with("cube")
     named = replace(world, effects=(ActiveEffect.of(load_effect("com_offset"), {}, world.gravity[0, :1]),))
     prepared = prepare(world, tosses(world, 3, 3, 0.3, 60.0, NOISE, (0.9, 1.2)), NOISE)
-    assert prepared.flight is not None and best_forms(prepared.flight, named, ["com_offset"], 1.0) == []
+    assert prepared.flight is not None and other_forms(prepared.flight, named, [("com_offset",)], 1.0) == []
