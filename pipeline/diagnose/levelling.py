@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..optimization.uncertainty import chi2_tail
+from ..optimization.tails import chi2_tail
 from ..physics.effects.registry import load_effect
 from ..physics.world import World
 from ..segments.candidates import Candidate, variants_of
