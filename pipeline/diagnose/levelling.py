@@ -4,7 +4,9 @@ A frame is levelled anew for each recording, or a ground is not level everywhere
 episode, but a few episodes may agree by chance, above all where one long flight tells nearly all that is known. A
 common tilt is therefore judged beside tilts of each episode's own: with the information I of an episode, its tilt is
 known to within I^-1 + tau^2, tau the usual tilt, so that the precision of all is P = sum I (1 + tau^2 I)^-1, the common
-tilt that of the scores g, P t = sum (1 + tau^2 I)^-1 g, and t' P t is distributed as chi2.
+tilt t that of the scores g, P t = sum (1 + tau^2 I)^-1 g. How far the episodes scatter about it (Cochran's Q) says how
+large their own tilts are; the usual tilt counts for some degrees of freedom beside it, as in `falsification`, and
+t' P t / 2 over that scatter is distributed as F.
 """
 
 from __future__ import annotations
@@ -12,8 +14,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..optimization.tails import chi2_tail
+from ..optimization.tails import f_tail
 from ..physics.effects.registry import load_effect
 from ..physics.world import World
 from ..segments.candidates import Candidate, variants_of
@@ -23,8 +26,12 @@ from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
 
+Array = NDArray[np.float64]
+
 TILTS = ("gravity_tilt", "frame_tilt")
 """Effects that are tilts, the same in flight."""
+TOLD = 0.05
+"""Information of an episode in that of a usual tilt from which it counts among those that tell their scatter."""
 
 
 def common_tilt_p(flight: Segments, world: World, groups: Sequence[int], dispersion: float) -> float:
@@ -39,11 +46,21 @@ def common_tilt_p(flight: Segments, world: World, groups: Sequence[int], dispers
     (tilt,) = variants_of([Candidate(TILTS[0], load_effect(TILTS[0]))], world.gravity[0, :1])
     linear = linearize(flight, world, [tilt], groups, robust=False)
     columns, own = linear.columns(tilt.parameters), LIMITS.levelled_rad**2
-    precision, slope = np.zeros((2, 2)), np.zeros(2)
+    parts: list[tuple[Array, Array, int]] = []
     for episode in np.unique(linear.episode):
         mine = linear.episode == episode
         information = linear.information[mine][:, columns][:, :, columns].sum(0) / dispersion
         shrunk = np.linalg.inv(np.eye(2) + own * information)
-        precision += information @ shrunk
-        slope += shrunk.T @ linear.score[mine][:, columns].sum(0) / dispersion
-    return chi2_tail(float(slope @ np.linalg.pinv(precision) @ slope), 2)
+        score = linear.score[mine][:, columns].sum(0) / dispersion
+        told = int((np.linalg.eigvalsh(information) * own > TOLD).sum())
+        parts.append((information @ shrunk, shrunk.T @ score, told))
+    precision, slopes = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
+    common = _explained(precision, slopes)
+    q = max(sum(_explained(matrix, slope) for matrix, slope, _ in parts) - common, 0.0)
+    dof, counts = max(sum(part[2] for part in parts) - 2, 0), LIMITS.model_counts
+    return f_tail(0.5 * common * (counts + dof) / (counts + q), 2, counts + dof)
+
+
+def _explained(precision: Array, slope: Array) -> float:
+    """Return the fall of chi2 by the tilt (2,) with a precision (2, 2) and slope (2,)."""
+    return float(slope @ np.linalg.pinv(precision, rcond=1e-3) @ slope)

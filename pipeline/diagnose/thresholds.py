@@ -229,10 +229,11 @@ class VerdictThresholds:
     levelled_rad: float = threshold(
         3e-3,
         "rad",
-        "standard deviation between episodes of how level frames are, at least, beside which a tilt that all have is "
-        "judged at `flight.repeated_alpha`",
-        "by argument: a spirit level shows 0.5 to 1 mm/m, boards and grounds are worse; of real-like development, 0 of "
-        "4 tilts that were something in no library stay, and 11 of 14 that were tilts",
+        "usual standard deviation between episodes of how level frames are, which counts for `model_counts` degrees of "
+        "freedom beside their scatter; a tilt that all have is judged beside it at `flight.repeated_alpha`",
+        "by argument: a spirit level shows 0.5 to 1 mm/m, boards and grounds are worse",
+        "real-like development: none of 4 forces in no library stays that was named a tilt, and of 4 tilts the one is "
+        "lost that moves the body by 8 slow errors",
     )
     rest_frames: int = threshold(8, "frames", "fewest at the end of an episode that show how a body lies", BY_ARGUMENT)
     still_rad: float = threshold(
@@ -280,6 +281,7 @@ class VerdictThresholds:
         "more than this",
         "by argument: as likely as not; at -1, 0 and 2, of 129 real-like development captures that hide what is in no "
         "library 3, 5 and 9 get a wrong name (20 without), and 10, 6 and 2 of 80 true names are lost",
+        "29 further ones: 2 get a wrong name, a gust (a tilt, before levels counted) and a cubic drag",
     )
     unlike_fall: tuple[float, float] = threshold(
         (0.5, 8.0),

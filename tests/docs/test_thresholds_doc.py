@@ -49,6 +49,7 @@ NUMERICS = {
     "form_families.USUAL_FLIGHT": "grid of forms that are averaged over",
     "form_families.SHARES": "grid of forms that are averaged over",
     "form_families.POWERS": "grid of forms that are averaged over",
+    "levelling.TOLD": "share of an episode's degrees of freedom",
     "form_fit.LEAST_SHARE": "keeps a matrix solvable",
     "form_fit.SINGULAR": "keeps a matrix solvable",
     "evidence.NEARLY": "rounding of a value at its bound",
