@@ -54,8 +54,7 @@ def common_tilt_p(flight: Segments, world: World, groups: Sequence[int], dispers
         score = linear.score[mine][:, columns].sum(0) / dispersion
         told = int((np.linalg.eigvalsh(information) * own > TOLD).sum())
         parts.append((information @ shrunk, shrunk.T @ score, told))
-    precision, slopes = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
-    common = _explained(precision, slopes)
+    common = _explained(np.sum([matrix for matrix, *_ in parts], 0), np.sum([slope for _, slope, _ in parts], 0))
     q = max(sum(_explained(matrix, slope) for matrix, slope, _ in parts) - common, 0.0)
     dof, counts = max(sum(part[2] for part in parts) - 2, 0), LIMITS.model_counts
     return f_tail(0.5 * common * (counts + dof) / (counts + q), 2, counts + dof)
