@@ -806,6 +806,11 @@ def test_vectors_of_rollouts_change_no_bit_on_the_cpu(monkeypatch: pytest.Monkey
     assert found.velocity_m_s.isfinite().all()
 
 
+def test_what_is_worth_a_program_of_vectors() -> None:
+    assert host._worth_vectors(8, 16, 1) and not host._worth_vectors(8, 15, 10**6)
+    assert host._worth_vectors(0, 100, 1000) and not host._worth_vectors(0, 100, 999)
+
+
 @NEEDS_COMPILER
 def test_flight_alone_is_for_the_kernel_too() -> None:
     world = replace(world_of(box_body()), touching=False, effects=(active("linear_drag", c=0.3),))
