@@ -17,11 +17,15 @@ Row = dict[str, Any]
 
 
 def record_figures(rows: Sequence[Row], command: str) -> None:
-    """Record the figures of a report, all contenders, in benchmarks/results/diagnose.jsonl."""
+    """Record the figures of a report, all contenders, in benchmarks/results/real_like.jsonl.
+
+    A figure of which the report has no capture stays as an older report has it.
+    """
     for who in dict.fromkeys(row["contender"] for row in rows):
         own = [row for row in rows if row["contender"] == who]
         for figure in figures(who, own):
-            record("real_like", command=command, **figure)
+            if figure["value"] != "0 of 0":
+                record("real_like", command=command, **figure)
 
 
 def figures(who: str, rows: Sequence[Row]) -> Iterator[Row]:
