@@ -17,7 +17,7 @@ LEVEL = ("gravity_tilt", "frame_tilt")
 """Effects that push across gravity, the same everywhere."""
 USUAL_FLIGHT = 0.75
 """Quantile of the episodes' flights of which times are shares."""
-SHARES = (0.3, 0.45, 0.6)
+SHARES = (0.15, 0.3, 0.45, 0.6)
 """Shares of a usual flight at which a force sets in or ends."""
 POWERS = (-1, 1, 2)
 """Powers of speed and spin, in their medians, that a force is multiplied by."""

@@ -280,7 +280,7 @@ class VerdictThresholds:
         "above a height, on one side of a place, by another power of speed or spin) are likelier than its own law by "
         "more than this",
         "by argument: as likely as not; at -1, 0 and 2, of 129 real-like development captures that hide what is in no "
-        "library 3, 5 and 9 get a wrong name (20 without), and 10, 6 and 2 of 80 true names are lost",
+        "library 3, 5 and 9 get a wrong name (20 without), and 9, 6 and 2 of 80 true names are lost",
         "29 further ones: 2 get a wrong name, a gust (a tilt, before levels counted) and a cubic drag",
     )
     unlike_fall: tuple[float, float] = threshold(
