@@ -54,9 +54,12 @@ def find_sliding_segments(world: World, whole: Observations, clear: Tensor, nois
         seen = (whole.seen[episode].amax(-1) > 0).nonzero()[:, 0]  # any frame may be hidden, the first included
         if len(seen) < 2:
             continue
-        steady = on[episode, seen].numpy() & ~_impacts(world, whole, episode, seen, noise)
+        near = on[episode, seen].numpy()
+        if not near.any():
+            continue
+        steady = near & ~_impacts(world, whole, episode, seen, noise, near)
         if not is_round(body):
-            steady &= ~_tilting(world, whole, episode, seen, noise.rotation_rad)
+            steady &= ~_tilting(world, whole, episode, seen, noise.rotation_rad, near)
         parts = _parts(times[seen].numpy(), steady)
         found += [Segment(episode, int(seen[first]), int(seen[last])) for first, last in parts]
     return without_rest(whole, found, noise)
@@ -84,14 +87,25 @@ def grounded_states(segments: Segments, state: State) -> State:
     return State(*fields)
 
 
-def _impacts(world: World, whole: Observations, episode: int, seen: Tensor, noise: Noise) -> NDArray[np.bool_]:
-    """Return the seen frames within one frame of a jump of the speed along the normal, or of the tilting."""
+def _impacts(
+    world: World, whole: Observations, episode: int, seen: Tensor, noise: Noise, asked: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return which of the asked frames are within one frame of a jump of the speed along the normal, or of the tilting.
+
+    Args:
+        world: For shape and ground.
+        whole: The episodes.
+        episode: Index of the episode.
+        seen: Indices of its seen frames.
+        noise: Standard deviations of the tracks.
+        asked: Which of the seen frames are asked for; the answer for others means nothing.
+    """
     body, normal = world.bodies[whole.free[0]], GroundPlane.of(world).normal
     height = (whole.position_m[episode, seen, 0] @ normal).numpy()
     quat, turned = whole.quat_wxyz[episode, seen, 0], whole.has_orientation[episode, seen, 0].numpy() > 0
     level = tangent_axes(normal)[1:]
     jumps = np.zeros(len(seen), np.bool_)
-    for places, frames, t in _windows(whole.times_s[episode, seen].numpy()):
+    for places, frames, t in _windows(whole.times_s[episode, seen].numpy(), _beside(asked)):
         inverse = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2, np.maximum(t, 0.0)], -1))[:, 3]
         spread = np.linalg.norm(inverse, axis=1)
         least = np.maximum(LIMITS.jump_m_s, LIMITS.jump_sigmas * noise.position_m * spread)
@@ -104,19 +118,26 @@ def _impacts(world: World, whole: Observations, episode: int, seen: Tensor, nois
             least = np.maximum(LIMITS.jump_m_s / size_of(body), LIMITS.jump_sigmas * noise.rotation_rad * spread)
             found |= known & (tilting > least)
         jumps[places] = found & ((t < 0).sum(1) >= 2) & ((t > 0).sum(1) >= 2)
-    wide = jumps.copy()
-    wide[1:] |= jumps[:-1]
-    wide[:-1] |= jumps[1:]
+    return _beside(jumps)
+
+
+def _beside(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the chosen frames and those next to one."""
+    wide = chosen.copy()
+    wide[1:] |= chosen[:-1]
+    wide[:-1] |= chosen[1:]
     return wide
 
 
-def _tilting(world: World, whole: Observations, episode: int, seen: Tensor, noise_rad: float) -> NDArray[np.bool_]:
-    """Return the seen frames at which the body does not stay on one of its sides."""
+def _tilting(
+    world: World, whole: Observations, episode: int, seen: Tensor, noise_rad: float, asked: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return at which of the asked frames the body does not stay on one of its sides; arguments as of `_impacts`."""
     normal = GroundPlane.of(world).normal
     turned = whole.has_orientation[episode, seen, 0].numpy() > 0
     up = (quat_to_matrix(whole.quat_wxyz[episode, seen, 0]).transpose(-1, -2) @ normal).numpy()
     tilts = np.zeros(len(seen), np.bool_)
-    for places, frames, t in _windows(whole.times_s[episode, seen].numpy()):
+    for places, frames, t in _windows(whole.times_s[episode, seen].numpy(), asked):
         known = turned[frames]
         # a frame that does not count is a row of zeros
         slope = np.linalg.pinv(np.stack([np.ones_like(t), t], -1) * known[..., None])[:, 1]
@@ -126,17 +147,21 @@ def _tilting(world: World, whole: Observations, episode: int, seen: Tensor, nois
     return tilts
 
 
-def _windows(times: Array) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
-    """Yield frames (n,) (of at least two), those within some steps of each (n, w), and their distance (n, w) [s].
+def _windows(times: Array, asked: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
+    """Yield asked frames (n,), those within some steps of each (n, w), and their distance (n, w) [s].
 
     Frames with as many others near them come together.
+
+    Args:
+        times: Of the frames, at least two [s].
+        asked: Which of them are asked for.
     """
     step = float(np.median(np.diff(times)))
     side = max(SIDE_FRAMES, round(SIDE_S / step))
     reach = (side + 0.5) * step
     firsts, ends = np.searchsorted(times, times - reach), np.searchsorted(times, times + reach)
-    for width in np.unique(ends - firsts).tolist():
-        places = np.flatnonzero(ends - firsts == width)
+    for width in np.unique((ends - firsts)[asked]).tolist():
+        places = np.flatnonzero((ends - firsts == width) & asked)
         frames = firsts[places, None] + np.arange(width)
         yield places, frames, times[frames] - times[places, None]
 
