@@ -42,6 +42,10 @@ _SCALE = 0.4
 """Scale of a sphere of the grid, in units of the grid spacing."""
 _SOLID = 0.15
 """Opacity above which a sphere of the grid counts as part of an object."""
+_HALFWAY = 0.5
+"""In the search on the ground it also has to be above this share of the way from the start to the most opaque sphere:
+the more steps, the more opaque become also spheres that only few photos require, and they join objects to each other.
+"""
 _REACH = 1.8
 """Distance below which two spheres touch, in units of the sum of their scales."""
 _SEARCHED = 0.6
@@ -113,7 +117,7 @@ class ObjectSearch:
         spheres, count, pitch = self._fitted([space], _ROUGH, f"{body.name}: search")
         clusters = [
             members
-            for members in self._clusters(spheres, count, pitch)
+            for members in self._clusters(spheres, count, pitch, _HALFWAY)
             if not any(region.contains(spheres.means[members].numpy().mean(0, keepdims=True))[0] for region in taken)
         ]
         weights = self._in_view(spheres, clusters)
@@ -218,13 +222,18 @@ class ObjectSearch:
             return np.full(len(points), np.inf)
         return points @ self._up - self._ground.offset_m
 
-    def _clusters(self, spheres: Spheres, count: int, pitch: float) -> list[NDArray[np.int64]]:
-        """Return the connected clusters of the grid's spheres that are solid and clear of the ground."""
+    def _clusters(self, spheres: Spheres, count: int, pitch: float, share: float = 0.0) -> list[NDArray[np.int64]]:
+        """Return the connected clusters of the grid's spheres that are solid and clear of the ground.
+
+        Solid is what is at least so far on the way from the start to the most opaque sphere, as a share.
+        """
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components  # dear to import, and seldom needed
 
         means, scales = spheres.means.numpy(), spheres.scales.numpy()
-        solid = (spheres.opacities[:count].numpy() > _SOLID) & (self._height(means[:count]) > 0.2 * pitch)
+        opacities = spheres.opacities[:count].numpy()
+        least = max(_SOLID, _START_OPACITY + share * (float(opacities.max(initial=0.0)) - _START_OPACITY))
+        solid = (opacities > least) & (self._height(means[:count]) > 0.2 * pitch)
         chosen = np.flatnonzero(solid)
         if len(chosen) == 0:
             return []

@@ -18,8 +18,10 @@ from cgwm.datasets.synthetic.objects import make_object, resting_down
 from cgwm.datasets.synthetic.plan import ScenePlan
 from cgwm.datasets.synthetic.record import build_set, take_photos, truth
 from cgwm.pipeline.fit import fit
+from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.sg_gs.body_separation import separate
 from cgwm.pipeline.sg_gs.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs.object_search import ObjectSearch
 from cgwm.pipeline.sg_gs.views import load_views, with_labels
 from cgwm.schemas import Body, CaptureManifest, Ground, InputDataError, PhotoBox, Shape, SplatConfig, World
 from cgwm.schemas.capture import SphereShape
@@ -118,17 +120,29 @@ def test_two_bodies_are_told_apart_by_their_boxes(balls):
 
 
 @pytest.mark.evidence
-def test_a_body_is_found_beside_one_with_masks_whose_labels_stay(balls):
+@pytest.mark.parametrize("iterations", [100, 200, 400])  # after 60 steps nothing is solid beside the first ball
+def test_a_body_is_found_beside_one_with_masks_whose_labels_stay(balls, iterations):
     capture, views, true = balls
     masked = [with_labels(view, np.where(true[view.name] == 1, 1, 0).astype(np.uint8), 2) for view in views]
     both = with_bodies(capture, Body(name="ball-0"), Body(name="ball-1"))
-    longer = CONFIG.model_copy(update={"iterations": 100})  # after 60 steps nothing is solid beside the first ball
-    result = separate(both, masked, [], Ground(), None, longer)
+    result = separate(both, masked, [], Ground(), None, CONFIG.model_copy(update={"iterations": iterations}))
     assert result is not None
     assert list(result.record) == ["ball-1"]
     for before, after in zip(masked, result.train, strict=True):
         np.testing.assert_array_equal(after.labels == 1, before.labels == 1)
     assert ious(result.train, true, 2).mean() > 0.7
+
+
+@pytest.mark.parametrize("steps", [1.0, 2.0, 4.0])
+def test_what_is_half_as_opaque_joins_no_objects(balls, steps):
+    """Two rows of spheres with a third between them, whose opacities all grow with the steps of the fit."""
+    capture, views, _ = balls
+    k = torch.arange(15)
+    means = torch.stack((0.02 * k, torch.zeros(15), torch.full((15,), 0.05)), 1)
+    opacities = 0.1 + steps * torch.where((k < 5) | (k >= 10), 0.2, 0.07)
+    spheres = Spheres(means, torch.full((15,), 0.008), opacities, torch.zeros(15, 3))
+    clusters = ObjectSearch(capture, views[:1], Ground(), None, CONFIG)._clusters(spheres, 15, 0.02, 0.5)
+    assert [members.tolist() for members in clusters] == [[*range(5)], [*range(10, 15)]]
 
 
 def test_no_body_is_separated_that_has_masks_or_a_shape(balls):
