@@ -45,11 +45,15 @@ def silhouette_errors(
     inside = cv2.erode(valid.astype(np.uint8), np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
     for body in range(bodies):
         for frame in range(frames):
-            pair = (real[frame] == body + 1) & valid, (predicted[frame] == body + 1) & valid
+            cut = _around(real[frame] == body + 1, predicted[frame] == body + 1)
+            if cut is None:
+                continue
+            pair = [(labels[frame][cut] == body + 1) & valid[cut] for labels in (real, predicted)]
             figures[:, frame, body] = _pair_errors(*pair)
+            corner = (cut[1].start, cut[0].start)
             for kind, mask in enumerate(pair):
-                if mask.any() and not (mask & ~inside).any():
-                    centroids[kind, frame, body] = _centroid(mask)
+                if mask.any() and not (mask & ~inside[cut]).any():
+                    centroids[kind, frame, body] = _centroid(mask) + corner
     return SilhouetteErrors(
         iou=figures[0],
         centroid_px=figures[1],
@@ -57,6 +61,14 @@ def silhouette_errors(
         real_centroids=centroids[0],
         predicted_centroids=centroids[1],
     )
+
+
+def _around(a: Mask, b: Mask) -> tuple[slice, slice] | None:
+    """Return the rectangle (rows, columns) around two masks, grown by a pixel; None if both are empty."""
+    x, y, width, height = cv2.boundingRect((a | b).view(np.uint8))
+    if width == 0:
+        return None
+    return slice(max(y - 1, 0), y + height + 1), slice(max(x - 1, 0), x + width + 1)
 
 
 def _pair_errors(real: Mask, predicted: Mask) -> tuple[float, float, float]:
@@ -78,9 +90,7 @@ def _centroid(mask: Mask) -> Array:
 
 def _outline_distance(a: Mask, b: Mask) -> float:
     """Return the mean distance of the pixels of either outline from the nearest of the other [px]."""
-    rows, columns = np.nonzero(a | b)
-    cut = slice(max(rows.min() - 1, 0), rows.max() + 2), slice(max(columns.min() - 1, 0), columns.max() + 2)
-    outlines = [_outline(mask[cut]) for mask in (a, b)]
+    outlines = [_outline(mask) for mask in (a, b)]
     away = [
         cv2.distanceTransform((~outline).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for outline in outlines
     ]
