@@ -42,7 +42,8 @@ def run_command(load_app: Callable[[], Callable[..., Any]], arguments: list[str]
         code = 1
     interrupts.end_work(code)
     code = code if _flushed() else code or 1
-    if interrupts.was_interrupted() or (ends and threading.active_count() == 1):
+    working = [thread for thread in threading.enumerate() if not thread.daemon]
+    if interrupts.was_interrupted() or (ends and working == [threading.main_thread()]):
         interrupts.leave(code)
     sys.exit(code)
 
