@@ -29,7 +29,7 @@ from .initialization import to_spheres
 _LARGEST = 0.15
 """Largest scale of a sphere of the ground, of the side of the grid; larger ones are backdrop."""
 _INPAINT_CELLS = 5
-_SPACING_CELLS, _SCALE_CELLS = 2, 1.3
+_SPACING_CELLS, _SCALE_CELLS = 1, 0.65
 """Distance and scale of the spheres that fill hidden ground, in cells."""
 _SUNK = 0.9 * THIN
 """Depth of their centres below the ground, in scales: on it they would cover the foot of a body that moves there, and
