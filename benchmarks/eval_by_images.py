@@ -108,7 +108,7 @@ def episode_row(one: EpisodeEvaluation, truth: TruthFile) -> dict[str, Any]:
     place, turn = np.asarray(motion.position_m)[rows], _rotation(np.asarray(motion.quat_wxyz)[rows])
     found, after = prediction.predicted(), ~prediction.warmup
     predicted, turned = found[0][:, 0], _rotation(found[1][:, 0])
-    alike = turn[0].inv() * _rotation(prediction.quat_wxyz[0])
+    alike = turn[0].inv() * _rotation(prediction.quat_wxyz[0, 0])
     if np.degrees(alike.magnitude()) < ALIKE_DEG:
         alike = Rotation.identity()
     com = np.asarray(truth.object.com_m)
