@@ -90,11 +90,8 @@ _FILES = (
     "meeting",  # which bodies may touch in a step
     "queue",  # contacts that lanes share out among each other
     "touching",  # the contacts of a pair
-    "ground_contact",  # the contacts of a body with the ground
-    "finding",  # the contacts of a step
-    "sweeps",  # iterations over impulses where lanes share one copy of the bodies, and what is kept of them
-    "iteration",  # iterations over impulses where each lane keeps all bodies
-    "collision",  # all contacts of a step and their impulses
+    "sweeps",  # iterations over impulses
+    "collision",  # all contacts of a step
     "rollout",  # an environment from its first frame to its last, and what is written of it
 )
 """Files of `kernels/` in the order in which they are compiled, after `language`; each names its formulas' origin."""

@@ -1,5 +1,4 @@
-// What lanes that share one copy of the bodies do in an iteration, what is kept of impulses for the next step, and what
-// labels say of them.
+// Iterations over the impulses of contacts, what is kept of them for the next step, and what labels say of them.
 #if RECORD
 // Adds the impulse of a contact, and its point of action, to the sums since the last frame.
 INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
@@ -29,6 +28,54 @@ INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
 #else
     if (across > Number(0.99) * plain(friction_of(law, c)) * along) tally.sliding += along;
 #endif
+}
+#endif
+
+#if PAIRED && !LINKS
+struct Load {  // what the contacts of a pair do to their bodies: change of a's velocity and, with the sign of a, of b's
+    Vec linear_a, linear_b, turn_a, turn_b;
+};
+
+struct Pushed {  // impulse of the contacts of a pair on a, and their moments about both centres of mass
+    Vec linear, angular_a, angular_b;
+};
+
+// Sums the impulses of the contacts from `first` to `end`, which belong to one pair, over the lanes.
+INLINE Pushed pushed_by(const Lanes& lanes, const Contact* list, int first, int end, int b) {
+    Pushed sum = {none(), none(), none()};
+    const bool both = b >= 0 && is_free(b);
+    for (int i = first; i < end; i++) {
+        const Contact& c = list[i];
+        sum.linear = sum.linear + c.impulse;
+        sum.angular_a = sum.angular_a + cross(c.arm, c.impulse);
+        if (both) sum.angular_b = sum.angular_b + cross(c.arm_b, c.impulse);
+    }
+    sum.linear = lanes.sum(sum.linear);
+    sum.angular_a = lanes.sum(sum.angular_a);
+    if (both) sum.angular_b = lanes.sum(sum.angular_b);
+    return sum;
+}
+
+INLINE Load load_of(const Pushed& pushed, int a, int b, const Motion* motions) {
+    Load load = {motions[a].inverse_mass * pushed.linear, none(), motions[a].inverse_inertia * pushed.angular_a, none()};
+    if (b >= 0 && is_free(b)) {
+        load.linear_b = motions[b].inverse_mass * pushed.linear;
+        load.turn_b = motions[b].inverse_inertia * pushed.angular_b;
+    }
+    return load;
+}
+
+// Aims the contacts of a pair at what they ask for under the present impulses of all other pairs: a contact so carries
+// the load that others put on its bodies, and not only their weight. `load` is that of the pair itself.
+INLINE void aim_under_load(const Law& law, Contact* list, int first, int end, const Load& load,
+                           const Motion* motions) {
+    for (int i = first; i < end; i++) {
+        Contact& c = list[i];
+        if (plain(c.target) < Number(-1e29)) continue;
+        Vec own = load.linear_a + cross(load.turn_a, c.arm);
+        if (c.b >= 0) own = own + load.linear_b + cross(load.turn_b, c.arm_b);
+        c.target = aim(law, c.gap, dot(relative_velocity(c, motions) - own, c.normal));
+    }
 }
 #endif
 
