@@ -87,7 +87,7 @@ class JointCommand:
     def at(self, time_s: Tensor) -> Tensor:
         """Return the targets (B, joints) at times (1 or B,) [s]."""
         batch = max(time_s.shape[0], self.times_s.shape[0], self.coefficients.shape[0])
-        grid = self.times_s.expand(batch, -1)
+        grid = self.times_s.expand(batch, -1).contiguous()  # or searchsorted warns and copies
         time = time_s.expand(batch)
         index = torch.searchsorted(grid.detach(), time.detach()[:, None].contiguous(), right=True).squeeze(-1) - 1
         index = index.clamp_min(0)

@@ -108,7 +108,7 @@ class Drive:
         """Return pose and velocity at times (B,) or (1,) [s]; the spin is the angular velocity, world frame [rad/s]."""
         batch = max(time_s.shape[0], self.times_s.shape[0])
         time = time_s.expand(batch)
-        grid = self.times_s.expand(batch, -1)
+        grid = self.times_s.expand(batch, -1).contiguous()  # or searchsorted warns and copies
         index = torch.searchsorted(grid, time.detach()[:, None].contiguous(), right=True).squeeze(-1) - 1
         index = torch.minimum(index.clamp_min(0), self.last.expand(batch))
         first, final = self._pick(grid, index * 0), self._pick(grid, self.last.expand(batch) + 1)
