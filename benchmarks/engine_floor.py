@@ -236,8 +236,9 @@ def impact_table() -> str:
     lines = ["| engine | " + " | ".join(MATERIALS) + " |", "| --- |" + " --- |" * len(MATERIALS)]
     for name in JUDGES:
         reason = refusal(name, load_item("box").solid)
-        cells = [reason] * len(MATERIALS)
-        if reason is None:
+        if reason is not None:
+            cells = [reason] * len(MATERIALS)
+        else:
             found = [np.percentile(friction_of_impacts(name, one), (50, 0, 100)) for one in MATERIALS]
             cells = [f"{middle:.2f} ({low:.2f} to {high:.2f})" for middle, low, high in found]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
