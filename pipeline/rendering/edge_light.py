@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...schemas import Light
@@ -38,6 +37,8 @@ class Edges:
     @staticmethod
     def of(means: Tensor, scales: Tensor, normals: Tensor) -> Edges:
         """Find them among spheres with centres (N, 3) [m], scales (N,) [m] and unit normals (N, 3), body frame."""
+        from scipy.spatial import KDTree  # dear to import, and needed with a light alone
+
         centers = means.cpu().numpy().astype(float)
         count = min(_NEIGHBOURS + 1, len(centers))
         found = KDTree(centers).query(centers, k=count)
