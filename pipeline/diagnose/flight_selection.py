@@ -22,10 +22,9 @@ from .flight_omnibus import flight_windows, is_significant, worst_omnibus
 from .flight_search import reselected
 from .group_values import with_group_values
 from .lasting_forces import without_lasting
-from .levelling import TILTS as TILTED
 from .levelling import common_tilt_p
 from .other_forms import OtherForms, other_forms
-from .own_tilt import TILTS, own_tilt_step
+from .own_tilt import OWN_TILTS, TILTS, own_tilt_step
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -192,7 +191,7 @@ def _without_levelling(prepared: Prepared, found: FlightSelection, scatter: floa
     left = found
     for step in found.steps:
         named = {one.name for one in step.equals}
-        if step.best.name not in left.names or not named & set(TILTED) or _carrying(left, step.best.name):
+        if step.best.name not in left.names or not named & set(OWN_TILTS) or _carrying(left, step.best.name):
             continue
         other = left.without({step.best.name})
         if other.flight is not None:

@@ -10,11 +10,10 @@ from torch import Tensor
 
 from ..physics.effects.effect import ActiveEffect
 from ..segments.force_fields import FlownMotion, ForceField
+from .own_tilt import OWN_TILTS
 
 UPWARD = ("gravity_scale", "length_scale", "clock_scale")
 """Effects that change the fall, and nothing across it."""
-LEVEL = ("gravity_tilt", "frame_tilt")
-"""Effects that push across gravity, the same everywhere."""
 USUAL_FLIGHT = 0.75
 """Quantile of the episodes' flights of which times are shares."""
 SHARES = (0.15, 0.3, 0.45, 0.6)
@@ -35,7 +34,7 @@ def own_field(motion: FlownMotion, active: ActiveEffect) -> ForceField | None:
     if field is not None:
         return field
     up, level = motion.axes
-    axes = {**dict.fromkeys(UPWARD, up), **dict.fromkeys(LEVEL, level)}.get(name)
+    axes = {**dict.fromkeys(UPWARD, up), **dict.fromkeys(OWN_TILTS, level)}.get(name)
     if axes is None:
         return None
     shape = (*motion.times_s.shape, *axes.shape)

@@ -22,14 +22,13 @@ from ..physics.world import World
 from ..segments.candidates import Candidate, variants_of
 from ..segments.linearization import linearize
 from ..segments.segments import Segments
+from .own_tilt import OWN_TILTS
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
 
 Array = NDArray[np.float64]
 
-TILTS = ("gravity_tilt", "frame_tilt")
-"""Effects that are tilts, the same in flight."""
 TOLD = 0.05
 """Information of an episode in that of a usual tilt from which it counts among those that tell their scatter."""
 
@@ -43,7 +42,7 @@ def common_tilt_p(flight: Segments, world: World, groups: Sequence[int], dispers
         groups: Session of each episode.
         dispersion: Factor by which variances exceed those of the noise.
     """
-    (tilt,) = variants_of([Candidate(TILTS[0], load_effect(TILTS[0]))], world.gravity[0, :1])
+    (tilt,) = variants_of([Candidate(OWN_TILTS[0], load_effect(OWN_TILTS[0]))], world.gravity[0, :1])
     linear = linearize(flight, world, [tilt], groups, robust=False)
     columns, own = linear.columns(tilt.parameters), LIMITS.levelled_rad**2
     parts: list[tuple[Array, Array, int]] = []
