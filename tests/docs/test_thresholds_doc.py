@@ -45,7 +45,7 @@ STATED = [
 TABLE = {f"{group}.{one.name}": one for group, some in thresholds_page.groups().items() for one in some}
 """Thresholds of a diagnosis, by group.field."""
 NUMERICS = {
-    "alternative_laws.FLATTEST": "keeps an ellipse from degenerating",
+    "friction_pyramid.FLATTEST": "keeps an ellipse from degenerating",
     "form_families.USUAL_FLIGHT": "grid of forms that are averaged over",
     "form_families.SHARES": "grid of forms that are averaged over",
     "form_families.POWERS": "grid of forms that are averaged over",

@@ -22,8 +22,8 @@ from ...segments.separate_starts import separate_starts
 from ...segments.sliding_descent import ITERATIONS, SlidingFit, information_by_segment
 from ...segments.sliding_fit import StartedSliding, better_starts, fit_sliding, nuisance_parameters
 from ...segments.thresholds import SEGMENT_THRESHOLDS
-from ..alternative_laws import FrictionPyramid
 from ..evidence import Evidence
+from ..friction_pyramid import FrictionPyramid
 from ..thresholds import THRESHOLDS, SlidingThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
 

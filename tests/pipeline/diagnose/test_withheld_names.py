@@ -9,7 +9,6 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose import flight_selection, verdict
-from cgwm.pipeline.diagnose.alternative_laws import FrictionPyramid
 from cgwm.pipeline.diagnose.contact_search import Chosen
 from cgwm.pipeline.diagnose.contact_tests import sliding
 from cgwm.pipeline.diagnose.contact_tests.contact_test import selected
@@ -17,6 +16,7 @@ from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
 from cgwm.pipeline.diagnose.effect_selection import SelectionStep
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.flight_selection import FlightSelection
+from cgwm.pipeline.diagnose.friction_pyramid import FrictionPyramid
 from cgwm.pipeline.diagnose.lasting_forces import without_lasting
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.diagnose.wording import _called, law_warnings

@@ -15,9 +15,7 @@ import torch
 from ..physics.contact_law import Touch
 from ..physics.effects.effect import Effect, Values
 from ..physics.impulse_solver import tangent_axes
-from .thresholds import THRESHOLDS
 
-LIMITS = THRESHOLDS.verdict
 FLATTEST = 0.02
 """Smallest share of the slip along an axis that is told from none: it keeps the ellipse from degenerating."""
 
