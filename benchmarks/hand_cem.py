@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.control.hand_controller import HandController
-from cgwm.pipeline.control.hand_objective import turn_to
 from cgwm.pipeline.control.horizon import Array, Forecast, Targets
 from cgwm.pipeline.control.planning import ControlPlan, ControlState
+from cgwm.pipeline.geometry.rotation import quat_turn
 from cgwm.schemas import HandTask
 from scipy.interpolate import interp1d
 
@@ -90,7 +90,7 @@ class CemController(HandController):
         noise = self._rng.normal(size=(SAMPLES - 1, *self.sigma.shape)) * self.sigma
         nodes = np.clip(np.concatenate((mean[None], mean + noise)), self.lower, self.upper)
         pose = self._predicted(state, nodes)
-        turn = turn_to(torch.as_tensor(pose[..., 3:].copy()), torch.as_tensor(self.goal_wxyz)).numpy()
+        turn = quat_turn(torch.as_tensor(self.goal_wxyz), torch.as_tensor(pose[..., 3:].copy())).numpy()
         place = pose[..., :3] - np.array(self.task.wanted_m)
         costs = PLACE_WEIGHT * (place**2).sum(-1).mean(-1) + TURN_WEIGHT * (turn**2).sum(-1).mean(-1)
         elites = costs.argsort()[:ELITES]

@@ -27,9 +27,9 @@ import numpy as np
 import torch
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import run_hand
-from cgwm.pipeline.control.hand_objective import turn_to
 from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
 from cgwm.pipeline.control.horizon import Array
+from cgwm.pipeline.geometry.rotation import quat_turn
 from cgwm.pipeline.physics.chain_state import joints_of
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.joint_command import JointCommand
@@ -173,7 +173,7 @@ def row(name: str, moments: list[Moment], predict: Callable[[], Motion], step_s:
 
 
 def _turn_deg(quat_wxyz: Array, goal_wxyz: Array) -> float:
-    return math.degrees(float(turn_to(torch.as_tensor(quat_wxyz)[None], torch.as_tensor(goal_wxyz)).norm()))
+    return math.degrees(float(quat_turn(torch.as_tensor(goal_wxyz), torch.as_tensor(quat_wxyz)).norm()))
 
 
 def _given(values: Array | None) -> Array:

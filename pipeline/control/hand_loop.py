@@ -9,9 +9,8 @@ import numpy as np
 import torch
 
 from ...schemas import ClockName, HandTask, NotConvergedError
-from ..geometry.rotation import quat_multiply
+from ..geometry.rotation import quat_multiply, quat_turn
 from .hand_controller import HandController
-from .hand_objective import turn_to
 from .hand_plant import HandPlant, HandTruth
 from .horizon import Array
 from .loop import Commander, Recording, Sensor
@@ -99,7 +98,7 @@ def hand_errors(task: HandTask, truth: HandTruth, goal_wxyz: Array) -> tuple[flo
 
 
 def _angle_deg(quat_wxyz: Array, goal_wxyz: Array) -> float:
-    turn = turn_to(torch.as_tensor(quat_wxyz)[None], torch.as_tensor(goal_wxyz))
+    turn = quat_turn(torch.as_tensor(goal_wxyz), torch.as_tensor(quat_wxyz))
     return math.degrees(float(turn.norm()))
 
 

@@ -74,7 +74,7 @@ class HandObjective:
         costs = self.hand.task.costs
         motion, targets = self._predicted(values, draws)
         place = motion.position_m[:, 1:, self.hand.object] - torch.tensor(self.hand.task.wanted_m, dtype=torch.float64)
-        turn = turn_to(motion.quat_wxyz[:, 1:, self.hand.object], torch.as_tensor(self.goal_wxyz))
+        turn = quat_turn(torch.as_tensor(self.goal_wxyz), motion.quat_wxyz[:, 1:, self.hand.object])
         lost = ((place.square().sum(-1, keepdim=True) + 1e-24).sqrt() - costs.keep_m).clamp_min(0.0)
         errors = torch.cat((place / costs.position_m, lost / costs.lost_m, turn / math.radians(costs.turn_deg)), -1)
         weight = torch.full((errors.shape[1],), costs.path / errors.shape[1], dtype=torch.float64)
@@ -146,8 +146,3 @@ class HandObjective:
             frames = min(FRAMES, steps)
             found += (found[-1] + length * np.round(np.arange(1, frames + 1) * steps / frames) / steps).tolist()
         return torch.tensor(found, dtype=torch.float64)
-
-
-def turn_to(quat_wxyz: Tensor, goal_wxyz: Tensor) -> Tensor:
-    """Return the rotation vectors (..., 3) [rad] from orientations (..., 4) to a goal (4,), the shorter way."""
-    return quat_turn(goal_wxyz, quat_wxyz)

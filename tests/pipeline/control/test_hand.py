@@ -15,10 +15,10 @@ from cgwm.datasets.models.model import Model, write_model
 from cgwm.datasets.rollouts.control_file import read_runs
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import goals_of, hand_start, run_hand
-from cgwm.pipeline.control.hand_objective import turn_to
 from cgwm.pipeline.control.hand_plant import HandModelPlant, HandScenePlant
 from cgwm.pipeline.control.hand_world import hand_world
 from cgwm.pipeline.control.planning import ControlState
+from cgwm.pipeline.geometry.rotation import quat_turn
 from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
@@ -204,18 +204,18 @@ def test_a_plan_turns_the_object_the_way_that_is_wanted(controller: HandControll
 def test_turns_are_measured_the_shorter_way() -> None:
     goal = torch.tensor([math.cos(0.4), 0.0, 0.0, math.sin(0.4)], dtype=torch.float64)
     for quat in (goal, -goal):
-        assert float(turn_to(quat[None], goal).norm()) == pytest.approx(0, abs=1e-9)
-    assert float(turn_to(torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64), goal).norm()) == pytest.approx(0.8)
+        assert float(quat_turn(goal, quat).norm()) == pytest.approx(0, abs=1e-9)
+    assert float(quat_turn(goal, torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)).norm()) == pytest.approx(0.8)
 
 
 def test_goals_are_the_turn_of_the_task_or_far_enough_apart(folder: Path) -> None:
     turn = hand_task(folder, goal={"turn_deg": 90.0}, start={"turn_deg": (-180.0, 180.0)})
     start, goal = hand_start(turn, 5)[1], next(goals_of(turn, 5))
-    assert math.degrees(float(turn_to(torch.as_tensor(start)[None], torch.as_tensor(goal)).norm())) == pytest.approx(90)
+    assert math.degrees(float(quat_turn(torch.as_tensor(goal), torch.as_tensor(start)).norm())) == pytest.approx(90)
     far = goals_of(hand_task(folder, goal={"kind": "random", "turn_deg": 60.0}), 1)
     drawn = [torch.as_tensor(next(far)) for _ in range(8)]
     for one, other in pairwise(drawn):
-        assert math.degrees(float(turn_to(one[None], other).norm())) >= 60
+        assert math.degrees(float(quat_turn(other, one).norm())) >= 60
 
 
 @pytest.mark.parametrize("kind", [HandModelPlant, HandScenePlant])
