@@ -25,7 +25,7 @@ from ..physics.observation_model import as_measured, true_times
 from ..physics.parameters import Parameter
 from ..physics.rollout import Rollout
 from ..physics.world import State, World
-from ..segments.candidates import Together, Variant, base_values, with_variants
+from ..segments.candidates import Variant, base_values, with_variants
 from ..segments.impact_fit import ImpactBase
 from ..segments.impact_velocities import measured_impacts
 from ..segments.prepare import Prepared
@@ -291,13 +291,13 @@ def _impacts(
     impacts = measured_impacts(made, world)
     if impacts is None:
         return None
-    found, base, columns = _of_impacts(world, ImpactBase.of(world, impacts), variants)
+    found, base, columns = _of_impacts(ImpactBase.of(world, impacts), variants)
     data, number, spread = np.zeros((1, *found.shape[1:])), 0, 1.0
     known = measured_impacts(prepared, world)
     if known is not None:
         fitted, number = ImpactBase.of(world, known), len(known)
         data = np.zeros((1 + int(known.episode.max()), *found.shape[1:]))
-        np.add.at(data, known.episode, _of_impacts(world, fitted, variants)[0])
+        np.add.at(data, known.episode, _of_impacts(fitted, variants)[0])
         degrees = np.maximum([number - 1, 5 * number - 1], 1)
         spread = max(1.0, float((fitted.fit.chi2 / degrees).max()))
     total = np.zeros((count, *found.shape[1:]))
@@ -314,13 +314,10 @@ def _impacts(
     )
 
 
-def _of_impacts(
-    world: World, base: ImpactBase, variants: Sequence[Variant]
-) -> tuple[Array, Array, tuple[tuple[int, ...], ...]]:
+def _of_impacts(base: ImpactBase, variants: Sequence[Variant]) -> tuple[Array, Array, tuple[tuple[int, ...], ...]]:
     """Return the information (n, P, P) of impacts, the prior of the nuisance parameters, and each variant's columns."""
-    together, first = Together.of(world, variants), len(base.parameters)
-    problem = replace(base.problem, world=together.world, parameters=(*base.parameters, *together.parameters))
-    value = torch.cat([torch.as_tensor(base.fit.values), base_values(together.world, together.parameters)])
+    problem, together, value = base.beside_each(variants)
+    first = len(base.parameters)
     owner = [-1] * first + [k for k, columns in enumerate(together.columns) for _ in columns]
     free = [*range(first), *(first + column for columns in together.columns for column in columns)]
     starts = value.repeat(1 + len(variants), 1)

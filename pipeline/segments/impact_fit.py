@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from ..physics.impulse_solver import tangent_axes
 from ..physics.parameters import CONTACT_TIME, DAMPING_RATIO, FRICTION, Parameter, apply_parameters
 from ..physics.world import World
 from ..trajectories.segmentation import GroundPlane
-from .candidates import Variant, base_values, with_variants
+from .candidates import Together, Variant, base_values, with_variants
 from .impact_law import Impact, after_impact, contact_law, point_velocity, rebound_speed
 from .impact_velocities import Impacts
 from .sliding_fit import contact_effect_parameters
@@ -300,6 +301,13 @@ class ImpactBase:
         zero = torch.zeros(len(own)).to(self.centre)
         problem = replace(self.problem, world=world, parameters=(*self.parameters, *own))
         return problem, torch.cat([torch.as_tensor(self.fit.values), zero])
+
+    def beside_each(self, variants: Sequence[Variant]) -> tuple[ImpactProblem, Together, torch.Tensor]:
+        """Return the problem with all candidates in it, these, and the values (P,) to start from, constants apart."""
+        together = Together.of(self.problem.world, variants)
+        problem = replace(self.problem, world=together.world, parameters=(*self.parameters, *together.parameters))
+        start = torch.cat([torch.as_tensor(self.fit.values), base_values(together.world, together.parameters)])
+        return problem, together, start
 
     def centre_of(self, start: torch.Tensor) -> torch.Tensor:
         """Return the centres of the priors of a problem with a candidate."""

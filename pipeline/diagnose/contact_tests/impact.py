@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...optimization.tails import f_tail
 from ...physics.contact_law import ContactLaw
-from ...segments.candidates import Candidate, Together, Variant, base_values
+from ...segments.candidates import Candidate, Variant
 from ...segments.impact_fit import BASE, ImpactBase, ImpactFit, fit_impacts
 from ...segments.impact_velocities import measured_impacts
 from ...segments.thresholds import SEGMENT_THRESHOLDS
@@ -97,10 +97,8 @@ def _changes(base: ImpactBase, variants: Sequence[Variant]) -> list[float]:
     """Return the change of the impacts [chi2] by each effect of the usual size, of either sign where both may be."""
     if not variants:
         return []
-    together, first = Together.of(base.problem.world, variants), len(base.parameters)
-    problem = replace(base.problem, world=together.world, parameters=(*base.parameters, *together.parameters))
-    start = torch.cat([torch.as_tensor(base.fit.values), base_values(together.world, together.parameters)])
-    starts = start.repeat(len(variants), 1)
+    problem, together, start = base.beside_each(variants)
+    first, starts = len(base.parameters), start.repeat(len(variants), 1)
     together.set_constants(starts, first)
     moves, owner = [], []
     for k, columns in enumerate(together.columns):
