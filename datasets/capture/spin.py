@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ...schemas import InputDataError
-from .quaternions import turns
+from ..shapes.turns import turn_between
 from .tracks import Track
 
 MOST_TURN_RAD = 0.8 * np.pi
@@ -35,7 +35,7 @@ def require_told_spin(path: Path, body: str, track: Track) -> None:
     """
     if track.quat_wxyz is None or len(track) < STEPS_IN_A_ROW + 1:
         return
-    step, between = np.diff(track.time_s), turns(track.quat_wxyz[:-1], track.quat_wxyz[1:])
+    step, between = np.diff(track.time_s), turn_between(track.quat_wxyz[:-1], track.quat_wxyz[1:])
     turn = np.linalg.norm(between, axis=1)
     axes = between / np.maximum(turn, 1e-12)[:, None]
     far = (turn > MOST_TURN_RAD) & (step <= GAP * np.median(step))

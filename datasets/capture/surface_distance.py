@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.surfaces import Surface
-from .quaternions import matrices
+from ..shapes.turns import matrix_of
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ def surface_distance(surfaces: Sequence[Surface], position_m: Array) -> Array:
     """
     found = np.full(len(position_m), np.inf)
     for surface in surfaces:
-        turn = matrices(np.asarray(surface.pose.quat_wxyz))
+        turn = matrix_of(np.asarray(surface.pose.quat_wxyz))
         local = (position_m - np.asarray(surface.pose.position_m)) @ turn
         found = np.minimum(found, _distance(surface, local))
     return found

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from ...schemas import Body, InputDataError
 from ..shapes.meshes import read_mesh
 from ..shapes.ply import read_splats
+from ..shapes.turns import matrix_of
 from .folder import CaptureFolder
 from .motion_windows import MotionWindows, motion_windows
-from .quaternions import matrices
 from .tracks import Track
 from .unit_mistakes import Order
 
@@ -82,8 +82,8 @@ class TrackedMotion:
 def _matrices(quat_wxyz: Array, order: Order) -> Array:
     """Return rotation matrices (T, 3, 3), body to world, of a track's columns (T, 4) in an assumed order."""
     if order == "xyzw":
-        return matrices(np.roll(quat_wxyz, 1, axis=1))
-    turn = matrices(quat_wxyz)
+        return matrix_of(np.roll(quat_wxyz, 1, axis=1))
+    turn = matrix_of(quat_wxyz)
     return turn.swapaxes(1, 2) if order == "inverse" else turn
 
 

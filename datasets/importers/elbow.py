@@ -150,7 +150,7 @@ def _tracks(file: Path, hinge: JointOfRobot) -> dict[str, Track]:
             "take the original file.",
         )
     time, quat, position = np.arange(len(rows), dtype=np.float64) * STEP_S, rows[:, :4] / norms[:, None], rows[:, 4:7]
-    turns = np.stack([matrix_of(one) for one in quat])
+    turns = matrix_of(quat)
     place = position + turns @ hinge.position_m
     own = np.stack([_about(hinge, angle) for angle in rows[:, 7]])
     second = np.stack(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...datasets.capture.quaternions import matrices as quaternion_matrices
+from ...datasets.shapes.turns import matrix_of
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -28,5 +28,5 @@ def rotation_matrix(quat_wxyz: np.ndarray) -> np.ndarray:
     directed = np.isfinite(norm) & (norm > 0)
     matrices = np.full((*norm.shape, 3, 3), np.nan)
     if directed.any():
-        matrices[directed] = quaternion_matrices(quat_wxyz[directed])
+        matrices[directed] = matrix_of(quat_wxyz[directed])
     return matrices

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...datasets.capture.quaternions import turns
+from ...datasets.shapes.turns import turn_between
 
 if TYPE_CHECKING:
     from ...datasets.capture.tracks import Track
@@ -71,7 +71,7 @@ def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> Noise:
         t = track.time_s[rows] - track.time_s[rows].mean(1, keepdims=True)
         positions.append(polynomial_residuals(t, track.position_m[:, moves(track.position_m)][rows], degree).ravel())
         if track.quat_wxyz is not None:
-            turned = turns(track.quat_wxyz[rows[:, WINDOW // 2], None], track.quat_wxyz[rows])
+            turned = turn_between(track.quat_wxyz[rows[:, WINDOW // 2], None], track.quat_wxyz[rows])
             rotations.append(polynomial_residuals(t, turned, degree).ravel())
     return Noise(max(spread(positions), FLOOR_M), max(spread(rotations), FLOOR_RAD))
 

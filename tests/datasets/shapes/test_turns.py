@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from cgwm.datasets.capture.quaternions import matrices, turns
+from cgwm.datasets.shapes.turns import matrix_of, turn_between
 from scipy.spatial.transform import Rotation
 
 
@@ -13,6 +13,6 @@ def test_matrices_and_turns_are_those_of_scipy() -> None:
     b[5:10] = -a[5:10]  # the same orientation
     b[10:15] = a[10:15] + 1e-7 * b[10:15]
     first, second = (Rotation.from_quat(quat, scalar_first=True) for quat in (a, b))
-    assert matrices(a) == pytest.approx(first.as_matrix(), abs=1e-14)
+    assert matrix_of(a) == pytest.approx(first.as_matrix(), abs=1e-14)
     unit_a, unit_b = (quat / np.linalg.norm(quat, axis=1, keepdims=True) for quat in (a, b))
-    assert turns(unit_a, unit_b) == pytest.approx((first.inv() * second).as_rotvec(), abs=1e-13)
+    assert turn_between(unit_a, unit_b) == pytest.approx((first.inv() * second).as_rotvec(), abs=1e-13)
