@@ -42,7 +42,7 @@ from cgwm.datasets.synthetic.objects import SolidObject
 from cgwm.schemas import NotConvergedError
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from store import Store
+from store import Keyed, Store
 from tabletop.capture import TASKS, Task, plan_capture
 from tabletop.engines import ENGINES, JUDGES, refusal
 from tabletop.materials import MATERIALS
@@ -62,7 +62,7 @@ UNIT_MM, UNIT_DEG = 10.0, 10.0
 
 
 @dataclass(frozen=True)
-class Job:
+class Job(Keyed):
     """One capture: `tests` motions of an object on a ground, by an engine."""
 
     stage: str
@@ -72,11 +72,6 @@ class Job:
     material: str
     seed: int
     tests: int
-
-    @property
-    def key(self) -> str:
-        """The result's key in the store."""
-        return "/".join(str(value) for value in vars(self).values())
 
 
 def jobs(stage: str, engines: Sequence[str], captures: int, tests: int) -> list[Job]:

@@ -35,7 +35,7 @@ from cgwm.pipeline.evaluate.stage import evaluate_model
 from cgwm.pipeline.fit import fit
 from cgwm.schemas import CalibrateConfig, CgwmError, PhysConfig, SplatConfig
 from scipy.spatial.transform import Rotation
-from store import Store
+from store import Keyed, Store
 from tabletop import MATERIALS, make_capture
 from tabletop.capture import TASKS, Task
 from tabletop.engines import refusal
@@ -49,7 +49,7 @@ _KINDS = (("true cameras", False), ("calibrated cameras", True))
 
 
 @dataclass(frozen=True)
-class Job:
+class Job(Keyed):
     """One capture."""
 
     task: Task
@@ -58,11 +58,6 @@ class Job:
     engine: str
     seed: int
     calibrated: bool
-
-    @property
-    def key(self) -> str:
-        """The result's key in the store."""
-        return "/".join(str(value) for value in vars(self).values())
 
 
 def drawn(seed: int) -> list[Job]:

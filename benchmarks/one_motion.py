@@ -27,7 +27,7 @@ from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
 from cgwm.pipeline.physics.world import World
 from cgwm.schemas import NotConvergedError, PhysConfig
-from store import Store
+from store import Keyed, Store
 from tabletop.capture import Task, plan_capture
 from tabletop.engines import ENGINES, refusal
 from tabletop.materials import MATERIALS
@@ -41,7 +41,7 @@ TASKS, LAWS = ("fall", "push", SLOW), ("shared", "own")
 
 
 @dataclass(frozen=True)
-class Job:
+class Job(Keyed):
     """One fit to one motion."""
 
     engine: str
@@ -50,11 +50,6 @@ class Job:
     material: str
     seed: int
     law: Literal["shared", "own"]
-
-    @property
-    def key(self) -> str:
-        """The result's key in the store."""
-        return "/".join(str(value) for value in vars(self).values())
 
 
 def jobs(engines: Sequence[str], objects: Sequence[str], seeds: Sequence[int]) -> list[Job]:

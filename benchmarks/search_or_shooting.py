@@ -35,7 +35,7 @@ from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import NotConvergedError, PhysConfig
 from one_motion import NOISE, noisy_episode, true_shape_world
-from store import Store
+from store import Keyed, Store
 from tabletop.capture import plan_capture
 from tabletop.engines import ENGINES, refusal
 from tabletop.materials import MATERIALS
@@ -46,18 +46,13 @@ TOLERANCES = (0.0, 1.5, 2.0, 3.0, 5.0, math.inf)
 
 
 @dataclass(frozen=True)
-class Job:
+class Job(Keyed):
     """One fit and what it predicts."""
 
     engine: str
     object: str
     material: str
     seed: int
-
-    @property
-    def key(self) -> str:
-        """The result's key in the store."""
-        return "/".join(str(value) for value in vars(self).values())
 
 
 def measure_job(job: Job) -> dict[str, Any]:

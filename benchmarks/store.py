@@ -27,6 +27,15 @@ def shared_data() -> Path | None:
     return folder if folder.is_dir() else None
 
 
+class Keyed:
+    """A job that is known by its fields."""
+
+    @property
+    def key(self) -> str:
+        """The result's key in the store."""
+        return "/".join(str(value) for value in vars(self).values())
+
+
 class Store:
     """The results of one benchmark.
 

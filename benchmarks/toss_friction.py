@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from engine_floor import UNIT_DEG, UNIT_MM
 from numpy.typing import NDArray
-from store import Store
+from store import Keyed, Store
 from tabletop.capture import plan_capture
 from tabletop.engines import ENGINES, refusal
 from tabletop.materials import MATERIALS
@@ -38,18 +38,13 @@ _STATED = FACTORS.index(1.0)
 
 
 @dataclass(frozen=True)
-class Job:
+class Job(Keyed):
     """The tosses of one capture."""
 
     engine: str
     object: str
     material: str
     seed: int
-
-    @property
-    def key(self) -> str:
-        """The result's key in the store."""
-        return "/".join(str(value) for value in vars(self).values())
 
 
 def measure(job: Job) -> dict[str, Any]:
