@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
+from ..geometry.sight_rays import projection_jacobian
 from .camera_models import LENS_PARAMETERS, focal_numbers
 from .reconstruction import Array, SfmCamera, SfmModel, distort
-from .triangulation import cross_matrices, projection_jacobian
+from .triangulation import cross_matrices
 
 POSE = 6
 """Numbers of a pose."""

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.sight_rays import projection_jacobian
 from .patch_alignment import RADIUS, laid_over, smoothed, templates
 from .reconstruction import Array, SfmModel, distort
-from .triangulation import projection_jacobian
 
 Ids = NDArray[np.int64]
 Mask = NDArray[np.bool_]

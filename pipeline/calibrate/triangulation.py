@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.sight_rays import least_squares_point, nearest_points, projection_jacobian, reprojection
 from .reconstruction import Array, SfmModel
 
 MAX_ERROR_PX = 4.0
@@ -65,7 +66,7 @@ def triangulate(
     if refined is None:
         return None
     point, good = refined
-    residual, jacobian = _residual(point, poses[good], rays[good], focal[good])
+    residual, jacobian = reprojection(point, poses[good], rays[good], focal[good])
     rms = float(np.sqrt(np.mean(residual**2) * 2.0))
     freedom = max(len(residual) - 3, 1)
     variance = max(float(residual @ residual) / freedom, noise_px**2)
@@ -123,27 +124,13 @@ def _refined(point: Array, poses: Array, rays: Array, focal: Array) -> tuple[Arr
     """
     good = _errors(point, poses, rays, focal) < MAX_ERROR_PX
     for _ in range(_SELECTIONS):
-        point = _least_squares_point(point, poses[good], rays[good], focal[good])
+        point = least_squares_point(point, poses[good], rays[good], focal[good])
         before, good = good, _errors(point, poses, rays, focal) < MAX_ERROR_PX
         if good.sum() < 2:
             return None
         if np.array_equal(good, before):
             break
     return point, good
-
-
-def _least_squares_point(point: Array, poses: Array, rays: Array, focal: Array) -> Array:
-    """Return the point of least squared reprojection errors from a nearby point, by one linear system.
-
-    An error is linear in the point but for its division by the depth (Hartley and Sturm, "Triangulation", 1997,
-    section 4.2). With the depths of the nearby point, the result differs from the minimum by the product of an error
-    and the relative change of depth.
-    """
-    rotation, shift = poses[:, :3, :3], poses[:, :3, 3]
-    weight = (focal / (rotation[:, 2] @ point + shift[:, 2]))[:, None]
-    matrix = (rotation[:, :2] - rays[:, :, None] * rotation[:, 2:]) * weight[..., None]
-    right = (rays * shift[:, 2:] - shift[:, :2]) * weight
-    return np.asarray(np.linalg.lstsq(matrix.reshape(-1, 3), right.ravel(), rcond=None)[0], np.float64)
 
 
 def _midpoints(centers: Array, directions: Array) -> Array:
@@ -155,9 +142,7 @@ def _midpoints(centers: Array, directions: Array) -> Array:
     """
     crossing = np.linalg.norm(np.cross(directions[:, 0], directions[:, 1]), axis=1) > _PARALLEL
     centers, directions = centers[crossing], directions[crossing]
-    projectors = np.eye(3) - directions[..., :, None] * directions[..., None, :]
-    right = np.einsum("pvij,pvj->pi", projectors, centers)
-    return np.linalg.solve(projectors.sum(axis=1), right[:, :, None])[:, :, 0]
+    return nearest_points(centers, directions)
 
 
 def _errors(points: Array, poses: Array, rays: Array, focal: Array) -> Array:
@@ -166,20 +151,6 @@ def _errors(points: Array, poses: Array, rays: Array, focal: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = np.linalg.norm(local[..., :2] / local[..., 2:] - rays, axis=-1) * focal
     return np.where(local[..., 2] > 0, errors, np.inf)
-
-
-def _residual(point: Array, poses: Array, rays: Array, focal: Array) -> tuple[Array, Array]:
-    local = poses[:, :3, :3] @ point + poses[:, :3, 3]
-    residual = (local[:, :2] / local[:, 2:] - rays) * focal[:, None]
-    jacobian = projection_jacobian(local) @ poses[:, :3, :3] * focal[:, None, None]
-    return residual.ravel(), jacobian.reshape(-1, 3)
-
-
-def projection_jacobian(local: Array) -> Array:
-    """Return d(x/z, y/z)/d(x, y, z), shape (point, 2, 3)."""
-    x, y, z = local.T
-    zero = np.zeros_like(z)
-    return np.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], axis=1).reshape(-1, 2, 3)
 
 
 def cross_matrices(vectors: Array) -> NDArray[np.float64]:

@@ -14,12 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.capture.cameras import Camera
+from ..geometry.sight_rays import least_squares_point, nearest_points, reprojection
 
 Array = NDArray[np.float64]
 
 SAME_INSTANT_S = 1e-6
 """Maximum difference of the times of frames at one instant [s]."""
 MIN_CAMERAS = 2
+_STEPS = 3
+"""Number of linear systems to a point: each takes the depths of the one before."""
 NORMAL_95 = 1.959964
 """Half width of the 95 % interval of a normal distribution, in standard deviations."""
 LEAST_STD = 2.2e-3
@@ -123,20 +126,19 @@ def _both(sightings: Sequence[Sighting], instant: int, rows: list[tuple[int, int
 
 def _pair(instant: int, seen: Sequence[tuple[Camera, Array, Array]]) -> _Pair:
     cameras = [camera for camera, _, _ in seen]
-    points, residuals = [], []
+    points, found = [], []
     for kind in (1, 2):
         pixels = np.array([one[kind] for one in seen])
-        point = triangulated(cameras, pixels)
-        points.append(point)
-        residuals.append(np.concatenate([_projected(c, point)[0] for c in cameras]) - pixels.ravel())
-    slope = np.concatenate([_projected(camera, points[0])[1] for camera in cameras])
+        points.append(triangulated(cameras, pixels))
+        found.append(reprojection(points[-1], *_sight(cameras, pixels)))
+    (real, slope), (predicted, _) = found
     covariance = np.asarray(np.linalg.inv(slope.T @ slope), np.float64)
-    apart = residuals[1] - residuals[0]
+    apart = predicted - real
     return _Pair(instant, points[1] - points[0], covariance, float(apart @ apart), 2 * len(cameras) - 3)
 
 
 def triangulated(cameras: Sequence[Camera], pixels: Array) -> Array:
-    """Return the point whose images are nearest to pixels, by Gauss-Newton from the midpoint of the rays.
+    """Return the point whose images are nearest to pixels.
 
     Args:
         cameras: Cameras without distortion.
@@ -145,29 +147,17 @@ def triangulated(cameras: Sequence[Camera], pixels: Array) -> Array:
     Returns:
         The point [m], world, shape (3,).
     """
-    point = _midpoint(cameras, pixels)
-    for _ in range(5):
-        found = [_projected(camera, point) for camera in cameras]
-        residual = np.concatenate([place for place, _ in found]) - pixels.ravel()
-        step, *_ = np.linalg.lstsq(np.concatenate([slope for _, slope in found]), residual, rcond=None)
-        point = point - step
+    poses, rays, focal = _sight(cameras, pixels)
+    directions = np.einsum("vji,vj->vi", poses[:, :3, :3], np.column_stack([rays, np.ones(len(rays))]))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    point = nearest_points(np.stack([camera.center for camera in cameras]), directions)
+    for _ in range(_STEPS):
+        point = least_squares_point(point, poses, rays, focal)
     return point
 
 
-def _midpoint(cameras: Sequence[Camera], pixels: Array) -> Array:
-    """Return the point with the least sum of squared distances from the rays through pixels."""
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    for camera, pixel in zip(cameras, pixels, strict=True):
-        ray = camera.T_world_cam[:3, :3] @ np.linalg.solve(camera.K, [*pixel, 1.0])
-        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
-        normal += across
-        right += across @ camera.T_world_cam[:3, 3]
-    return np.asarray(np.linalg.solve(normal, right), np.float64)
-
-
-def _projected(camera: Camera, point: Array) -> tuple[Array, Array]:
-    """Return the image (2,) [px] of a point and its derivative (2, 3) [px/m]."""
-    rotation = camera.T_cam_world[:3, :3]
-    x, y, z = camera.K @ (rotation @ point + camera.T_cam_world[:3, 3])
-    slope = np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]]) @ camera.K @ rotation
-    return np.array([x / z, y / z]), slope
+def _sight(cameras: Sequence[Camera], pixels: Array) -> tuple[Array, Array, Array]:
+    """Return poses T_cam_world (v, 4, 4), rays (v, 2) through pixels (v, 2), and focal lengths (v, 2) [px]."""
+    intrinsics = np.stack([camera.K for camera in cameras])
+    focal = np.stack([intrinsics[:, 0, 0], intrinsics[:, 1, 1]], 1)
+    return np.stack([camera.T_cam_world for camera in cameras]), (pixels - intrinsics[:, :2, 2]) / focal, focal
