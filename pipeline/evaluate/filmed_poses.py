@@ -20,6 +20,7 @@ from ...datasets.models.joints import refuse_joints
 from ...datasets.models.model import Model
 from ...schemas import InputDataError, NotConvergedError, PhysConfig
 from ..geometry.rotation import geodesic_angle
+from ..optimization.uncertainty import size_interval
 from ..phys_geo.images.pose_tracking import pose_noise
 from ..phys_geo.images.silhouettes import body_outlines
 from ..phys_geo.images.video_episodes import VideoEpisode, load_video_episode, track_warnings
@@ -36,8 +37,6 @@ IMAGE_SIZE = PhysConfig().image_size
 DOUBTFUL_TURN_DEG = 90.0
 """Turn between two frames above which the poses are doubted: the largest true one in 15 episodes is 38 deg, and the one
 wrong turn 140 deg."""
-NORMAL_95 = 1.959964
-"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
 SHARED_PX = 0.25
 """Standard deviation of the place of an edge in the compared images by errors of shape, colour and camera [px], which
 last as long as an episode and do not show in the scatter of the pixels. Chosen on 15 filmed episodes of five benchmark
@@ -75,15 +74,11 @@ class PoseUncertainty:
             place = np.einsum("fi,fij,fj->f", along[:, body], block[:, :3, :3], along[:, body])
             turn = np.trace(block[:, 3:, 3:], axis1=1, axis2=2) / 3
             spread.append(np.sqrt(np.maximum([place, turn], 0.0)).mean(1))
-        reach = NORMAL_95 * np.mean(spread, axis=0)
-        return _around(moved, float(reach[0])), _around(turned, float(np.degrees(reach[1])))
+        place_std, turn_std = np.mean(spread, axis=0)
+        return size_interval(moved, float(place_std)), size_interval(turned, float(np.degrees(turn_std)))
 
 
 Interval = tuple[float, float]
-
-
-def _around(value: float, reach: float) -> Interval:
-    return max(value - reach, 0.0), value + reach
 
 
 @dataclass(frozen=True, eq=False)

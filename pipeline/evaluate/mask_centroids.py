@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ...datasets.capture.cameras import Camera
 from ..geometry.sight_rays import least_squares_point, nearest_points, reprojection
+from ..optimization.uncertainty import size_interval
 
 Array = NDArray[np.float64]
 
@@ -23,8 +24,6 @@ SAME_INSTANT_S = 1e-6
 MIN_CAMERAS = 2
 _STEPS = 3
 """Number of linear systems to a point: each takes the depths of the one before."""
-NORMAL_95 = 1.959964
-"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
 LEAST_STD = 2.2e-3
 """Minimum standard deviation of a centroid, as a share of the picture's width (0.7 px of 320): the middle of a
 silhouette moves against the centre of mass when a body turns, which two cameras do not show as a disagreement. On the
@@ -68,10 +67,10 @@ def centroid_distance(sightings: Sequence[Sighting]) -> CentroidDistance | None:
     freedoms = sum(pair.freedoms for pair in pairs)
     std_px = max(float(np.sqrt(squares / freedoms)), LEAST_STD * sightings[0].cameras[0].width)
     distances = np.array([float(np.linalg.norm(pair.shift_m)) for pair in pairs])
-    reach = NORMAL_95 * std_px * float(np.mean([_std_along(pair) for pair in pairs]))
+    std_m = std_px * float(np.mean([_std_along(pair) for pair in pairs]))
     mean = float(distances.mean())
-    interval = (max(mean - reach, 0.0), mean + reach)
-    return CentroidDistance(mean, float(distances[-1]), interval, len({pair.instant for pair in pairs}))
+    instants = len({pair.instant for pair in pairs})
+    return CentroidDistance(mean, float(distances[-1]), size_interval(mean, std_m), instants)
 
 
 @dataclass(frozen=True, eq=False)

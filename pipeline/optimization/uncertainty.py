@@ -85,3 +85,8 @@ def inverse(information: Array) -> Array:
 
 REACH = 1.96
 """Half width of a 95 % interval of a normal variable, in standard errors."""
+
+
+def size_interval(size: float, std: float) -> tuple[float, float]:
+    """Return the 95 % interval of a size, which is 0 or more, with a normal error."""
+    return max(size - REACH * std, 0.0), size + REACH * std
