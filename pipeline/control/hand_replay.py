@@ -15,6 +15,7 @@ from .film import AHEAD_S, predicted_at
 from .hand_film import dotted_model
 from .hand_world import HandWorld, hand_world
 from .horizon import Array
+from .replayed_states import replay_of
 
 
 def hand_replays(
@@ -73,11 +74,4 @@ def _replay(hand: HandWorld, run: RunTables, pose: Array) -> Replay:
         hand.state(row[:3], row[3:], dict(zip(hand.joints, joints.tolist(), strict=True)))
         for row, joints in zip(pose, run.arrays["obs/joints"], strict=True)
     ]
-    none = np.zeros((len(states), 3))
-    return Replay(
-        times_s=run.arrays["control/time"],
-        position_m=np.stack([state.position_m[0].numpy() for state in states]),
-        quat_wxyz=np.stack([state.quat_wxyz[0].numpy() for state in states]),
-        contact_m=none,
-        impulse_n_s=none,
-    )
+    return replay_of(run.arrays["control/time"], states)

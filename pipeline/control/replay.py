@@ -12,9 +12,11 @@ from ...datasets.rollouts.control_file import RunTables, read_runs
 from ...datasets.rollouts.replay import Replay
 from ...schemas import HAND_FORMAT, ControlResult, ControlTask, HandTask, InputDataError, parse, read_json
 from ...schemas.documents import parse_json
+from ..physics.world import State
 from .film import AHEAD_S, predicted_at, visible_model
 from .hand_replay import hand_replays
 from .horizon import Array
+from .replayed_states import replay_of
 from .task_world import TaskWorld, task_world
 
 DOCUMENT = "control.json"
@@ -69,7 +71,8 @@ def _plant(found: TaskWorld, run: RunTables) -> Replay:
     ahead = found.task.robot.radius_m * force / np.maximum(size, 1e-12)
     height = np.full((len(times), 1), found.finger_z)
     contact = np.concatenate((arrays["obs/finger"], height), -1) + ahead
-    return _replay(found, times, arrays["obs/object"], arrays["obs/finger"], contact, force * length[:, None])
+    states = _states(found, arrays["obs/object"], arrays["obs/finger"])
+    return replay_of(times, states, contact, force * length[:, None])
 
 
 def _predicted(found: TaskWorld, run: RunTables) -> Replay:
@@ -79,18 +82,9 @@ def _predicted(found: TaskWorld, run: RunTables) -> Replay:
     actual = zip(run.arrays["obs/object"], run.arrays["obs/finger"], strict=True)
     shown = [pair or real for pair, real in zip(pairs, actual, strict=True)]
     poses, fingers = (np.array(column) for column in zip(*shown, strict=True))
-    none = np.zeros((len(times), 3))
-    return _replay(found, times, poses, fingers, none, none)
+    return replay_of(times, _states(found, poses, fingers))
 
 
-def _replay(
-    found: TaskWorld, times_s: Array, pose: Array, finger_m: Array, contact_m: Array, impulse_n_s: Array
-) -> Replay:
-    states = [found.state(row[:3], row[3:], point) for row, point in zip(pose, finger_m, strict=True)]
-    return Replay(
-        times_s=times_s,
-        position_m=np.stack([state.position_m[0].numpy() for state in states]),
-        quat_wxyz=np.stack([state.quat_wxyz[0].numpy() for state in states]),
-        contact_m=contact_m,
-        impulse_n_s=impulse_n_s,
-    )
+def _states(found: TaskWorld, pose: Array, finger_m: Array) -> list[State]:
+    """Return the states with the object at poses (T, 7) and the finger at places (T, 2) [m]."""
+    return [found.state(row[:3], row[3:], point) for row, point in zip(pose, finger_m, strict=True)]
