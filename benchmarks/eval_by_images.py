@@ -15,12 +15,9 @@ are then counted from it, as the prediction begins with it, too.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import shutil
 import sys
-import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -149,9 +146,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             known = [one for one in episodes if one[f"found_{key}"] is not None]
             if known:
                 off = [scale * abs(one[f"found_{key}"] - one[f"true_{key}"]) for one in known]
-                hold = sum(
-                    one[f"interval_{key}"][0] <= one[f"true_{key}"] <= one[f"interval_{key}"][1] for one in known
-                )
+                hold = sum(_holds(one[f"interval_{key}"], one[f"true_{key}"]) for one in known)
                 middle, high = np.percentile(off, (50, 90))
                 figures = f"{middle:.2f}, {high:.2f} {unit} | {hold} of {len(known)}"
                 lines.append(f"| {words} | {len(chosen)}, {len(known)} | {name} | {figures} |")
@@ -170,29 +165,19 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=800)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="end after this time")
+    parser.add_argument("--seconds", type=float, help="begin none after this time")
     parser.add_argument("--folder", type=Path, default=Path("out") / "eval_by_images", help="captures and models")
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
     parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
     given = parser.parse_args()
     store = Store("eval_by_images", given.store, given.any_commit)
     if given.what == "run":
-        _run(store, [job for job in drawn(given.seed) if store.known(job.key) is None], given)
+        given.folder.mkdir(parents=True, exist_ok=True)
+        folder = given.folder.resolve()
+        arguments = {job.key: (job, folder, given.device) for job in drawn(given.seed)}
+        store.fill(measure, arguments, given.workers, given.seconds)
     print(table(store.results()))
     return 0
-
-
-def _run(store: Store, jobs: Sequence[Job], given: argparse.Namespace) -> None:
-    deadline = time.monotonic() + given.seconds
-    given.folder.mkdir(parents=True, exist_ok=True)
-    pool = ProcessPoolExecutor(given.workers, mp_context=multiprocessing.get_context("spawn"))
-    futures = {pool.submit(measure, job, given.folder.resolve(), given.device): job for job in jobs}
-    try:
-        for future in as_completed(futures, None if given.seconds == float("inf") else given.seconds):
-            store.add(futures[future].key, future.result())
-    except TimeoutError:
-        print(f"{sum(not one.done() for one in futures)} captures are left.", file=sys.stderr)
-    pool.shutdown(wait=time.monotonic() < deadline, cancel_futures=True)
 
 
 if __name__ == "__main__":

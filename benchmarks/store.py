@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import platform
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -80,21 +81,31 @@ class Store:
         print(json.dumps(row), flush=True)
         return row
 
-    def fill(self, work: Callable[..., dict[str, Any]], arguments: Mapping[str, tuple[Any, ...]], workers: int) -> None:
+    def fill(
+        self,
+        work: Callable[..., dict[str, Any]],
+        arguments: Mapping[str, tuple[Any, ...]],
+        workers: int,
+        seconds: float | None = None,
+    ) -> None:
         """Store what `work` returns for the arguments of each key that has no result, from processes of one thread.
 
         Args:
             work: A function of a module, which the processes import.
             arguments: Arguments by key.
             workers: Number of processes.
+            seconds: Time after which none is begun any more [s]; None for all.
         """
         os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
         with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
             missing = [key for key in arguments if self.known(key) is None]
             waiting = {pool.submit(_timed, work, arguments[key]): key for key in missing}
             try:
-                for done in as_completed(waiting):
+                for done in as_completed(waiting, seconds):
                     self.add(waiting[done], done.result())
+            except TimeoutError:
+                pool.shutdown(wait=False, cancel_futures=True)
+                print(f"{sum(not one.done() or one.cancelled() for one in waiting)} are left.", file=sys.stderr)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)  # else what waits runs to its end before the error shows
                 raise
