@@ -110,7 +110,7 @@ def run(root: Path, work: Path, options: argparse.Namespace) -> dict[str, Any]:
     while True:
         test_all(mutants, results, (tests, by_line, bad), slots, options, kept)
         mutants = reached(mutants, results)
-        kept.write_text(json.dumps(results, indent=1))
+        kept.write_text(json.dumps(results))
         wrong = control(results, tests, slots) - bad
         if not wrong:
             break
@@ -164,7 +164,7 @@ def test_all(
             if slot.pid and (over := slot.ended()) is not None:
                 assert slot.mutant is not None
                 take(results[key_of(slot.mutant)], over, slot)
-                kept.write_text(json.dumps(results, indent=1))
+                kept.write_text(json.dumps(results))
             if not slot.pid and waiting:
                 mutant, names = waiting.pop(0)
                 expected = sum(tests[name]["seconds"] for name in names)
