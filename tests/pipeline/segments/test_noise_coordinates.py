@@ -18,6 +18,21 @@ def test_coordinates_of_noise_give_it_back(share: float) -> None:
         assert getattr(found, name) == pytest.approx(value, rel=2 * LEAST_WHITE), name
 
 
+def test_noise_without_slow_parts_has_none() -> None:
+    found = Components.of(np.log([0.8, 0.6, 0.012]), (), 1.5).noise(())
+    white, fast = 0.64 + LEAST_WHITE * 0.36, 0.36
+    assert found == CorrelatedNoise(
+        share=pytest.approx(fast / (white + fast)), time_s=pytest.approx(0.012),
+        size=pytest.approx(np.sqrt(white + fast)), slow=0.0, slow_time_s=pytest.approx(1.0), order=1.5,
+    )  # fmt: skip
+    assert Components.of(np.log([0.8, 0.6, 0.012, 2.0]), ("sway",), 0.5).noise((0, 1, 2))[3:7] == (
+        0.0,
+        1.0,
+        2.0,
+        (0, 1, 2),
+    )
+
+
 @pytest.mark.parametrize("gains", [(40.0,), (-9.0, 4.0, 5.0), (-9.0, -10.0, -11.0)])
 def test_what_one_episode_or_no_gain_shows_is_no_repeated_force(gains: tuple[float, ...]) -> None:
     assert RepeatedForce(coordinate="x", frame="world", gains=gains).p_value == 1.0

@@ -7,7 +7,7 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics.parameters import Parameter
-from cgwm.pipeline.segments.first_contact_fit import _prior
+from cgwm.pipeline.segments.first_contact_fit import MAX_WINDOWS, _prior, windows_of
 from cgwm.pipeline.segments.held_out_gain import HeldOutGain
 from cgwm.pipeline.segments.segment_fit import Linear, Refit, robust_excess
 from cgwm.pipeline.segments.segments import Segments, _line
@@ -109,6 +109,29 @@ def test_only_wanted_parameters_have_a_prior_in_windows_of_first_contacts() -> N
     centre, information = _prior(parameters, 1, torch.zeros((), dtype=F64))
     torch.testing.assert_close(centre, torch.tensor([0.3, 2.0], dtype=F64).log())
     assert information.tolist() == [pytest.approx(1 / 0.5**2), 0.0]
+
+
+@pytest.mark.parametrize("lead", [None, 5])
+def test_windows_reach_from_frames_before_the_first_contact_to_a_time_after_it(lead: int | None) -> None:
+    """A ball falls at 1 m/s from 0.1 m; another one flies on."""
+    world, t = world_of(ball_body(0.04)), np.arange(21) / 100
+    high, rest = np.array([0.0, 0.0, 0.14]), np.array([-9.0, -9.0, 0.04])
+    places = [np.maximum(np.outer(t, [0.5, 0.0, -1.0]) + high, rest), np.outer(t, [0.5, 0.0, 1.0]) + high]
+    turned = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
+    episodes = [(f"{k}", {"ball": Track(3.0 + t, place, turned)}) for k, place in enumerate(places)]
+    picked, windows, contacts = windows_of(world, episodes, lead, 0.06)
+    assert [name for name, _ in picked] == ["0", "1"]
+    assert 3.08 < contacts[0] <= 3.1 + 1e-9 and contacts[1] == math.inf
+    first = contacts[0] - 0.05 if lead else 3.0
+    np.testing.assert_allclose(windows[0], (first, contacts[0] + 0.06), atol=1e-8)
+    np.testing.assert_allclose(windows[1], (3.16 if lead else 3.0, 3.2 + 0.06), atol=1e-8)
+
+
+def test_windows_are_of_episodes_evenly_spread_and_no_more_than_determine_the_mass() -> None:
+    world, t = world_of(ball_body(0.04)), np.arange(4) / 100
+    track = Track(t, np.array([[0.0, 0.0, 0.2 + s] for s in t]), np.tile([1.0, 0.0, 0.0, 0.0], (4, 1)))
+    picked, windows, _ = windows_of(world, [(str(k), {"ball": track}) for k in range(2 * MAX_WINDOWS - 1)], None, 0.0)
+    assert [name for name, _ in picked] == [str(2 * k) for k in range(MAX_WINDOWS)] and len(windows) == MAX_WINDOWS
 
 
 def test_a_line_goes_through_what_counts_of_it() -> None:
