@@ -1,5 +1,8 @@
 """Pictures of reports: colours of masks, the window in which an object moves, outlines, and small files."""
 
+import base64
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +11,10 @@ from cgwm.pipeline.rendering.contact_sheets import (
     _outline,
     _window,
     compared,
+    depth_colors,
+    jpeg_uri,
     label_colors,
+    png_uri,
     separated,
     small_png,
     telling,
@@ -89,3 +95,22 @@ def test_separated_bodies_are_bright_on_a_dimmed_background_four_in_a_row() -> N
     assert sheet.shape == (2 * 60 + 4, 4 * 80 + 3 * 4, 3)  # as high as a photo at this width
     assert sheet[30, 40].tolist() == [90, 90, 90] and sheet[4, 4].tolist() == [30, 30, 30]
     assert sheet[64 + 30, 40].tolist() == [90, 90, 90] and (sheet[64:, 84:] == 255).all()
+
+
+def test_near_depths_are_bright_and_what_has_no_surface_is_black() -> None:
+    depth = np.array([[0.0, 0.5, 1.0, 1.5, 2.0, 9.0]], np.float32)
+    shown = depth_colors(depth, 1.0, 2.0)
+    viridis = cv2.applyColorMap(np.array([[255, 255, 127, 0, 0]], np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    assert shown[0, 0].tolist() == [0, 0, 0]
+    np.testing.assert_array_equal(shown[0, 1:], viridis[0])
+    assert depth_colors(depth, 1.0, 1.0)[0, 1].tolist() == viridis[0, 0].tolist()  # all of one depth
+
+
+@pytest.mark.parametrize(("made", "kind", "error"), [(jpeg_uri, "jpeg", 6), (png_uri, "png", 0)])
+def test_a_picture_in_a_page_is_read_back_in_its_colours(made: Callable, kind: str, error: int) -> None:
+    picture = np.full((16, 24, 3), [200, 120, 40], np.uint8)
+    uri = made(picture)
+    assert uri.startswith(f"data:image/{kind};base64,")
+    data = np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8)
+    read = cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]
+    np.testing.assert_allclose(read, picture, atol=error)
