@@ -23,6 +23,8 @@ from spread import spread
 
 PACKAGES = {"cgwm_cli": "cli", "schemas": "schemas", "datasets": "datasets", "pipeline": "pipeline"}
 """Folders of the tree by the name that they have inside the package."""
+TOGETHER = 5
+"""Short files of tests that one process runs."""
 Lines = set[tuple[str, int]]
 
 
@@ -227,6 +229,11 @@ def longest_first(root: Path, work: Path, chosen: Sequence[str]) -> list[str]:
     return sorted(sizes, key=lambda name: sizes[name], reverse=True)
 
 
+def batches(names: Sequence[str], alone: int) -> list[Sequence[str]]:
+    """Return the first files alone and the others, which are short, together: each process imports the product."""
+    return [[name] for name in names[:alone]] + [names[k : k + TOGETHER] for k in range(alone, len(names), TOGETHER)]
+
+
 def make_map(root: Path, work: Path, jobs: int, limit_s: float | None, chosen: Sequence[str]) -> None:
     """Run the tests once, and keep which of them run which line; a test that has not ended in time counts for none."""
     target = work / "map"
@@ -235,10 +242,10 @@ def make_map(root: Path, work: Path, jobs: int, limit_s: float | None, chosen: S
     environment = environment_of(root) | {"MUTANTS_MAP": str(target)}
     del environment["PYTHONDONTWRITEBYTECODE"]
     words = ["-q", "-p", "line_map", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=short", "-rfEs"]
-    parts = [[*words, name] for name in longest_first(root, work, chosen)]
+    parts = [[*words, *names] for names in batches(longest_first(root, work, chosen), 4 * jobs)]
     left = spread(root, target, parts, environment, jobs, limit_s)
     tests = merged(target)
     (work / "map.json").write_text(json.dumps(tests))
     print(f"{len(tests)} tests that pass, {sum(t['seconds'] for t in tests.values()):.0f} s of them")
     for part in left:
-        print(f"not ended in time: {part[-1]}")
+        print(f"not ended in time: {' '.join(part[len(words) :])}")

@@ -54,8 +54,8 @@ class Slot:
             path.write_bytes(applied(self.before, mutant))
         self.mutant, self.count, self.began, self.limit = mutant, len(tests), time.monotonic(), limit
         stop = ["-x"] if mutant is not None else []
-        self.words = ["-q", *stop, "-p", "no:cacheprovider", "-p", "no:xdist", f"--rootdir={self.tree}", *tests]
-        self.words += [f"--basetemp={self.folder / 'tmp'}", "-rfE", "--tb=no", "-W", "ignore"]
+        self.words = ["-q", *stop, "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "named_order", *tests]
+        self.words += [f"--rootdir={self.tree}", f"--basetemp={self.folder / 'tmp'}", "-rfE", "--tb=no", "-W", "ignore"]
         self.words += ["-c", str(self.tree / "pyproject.toml")]
         self.pid = fork_pytest(self.tree, self.environment, self.words, self.folder / "log")
 
