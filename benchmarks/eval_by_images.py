@@ -9,16 +9,19 @@ cameras that `cgwm calibrate` finds in its photos, the others the true ones. Cap
 draws, each with a seed of its own.
 
 A pose that is turned by more than 45 deg in the first frame was taken for another that looks alike: errors of rotation
-are then counted from it, as the prediction begins with it, too.
+are then counted from it, as the prediction begins with it, too. The world of calibrated cameras lies a little
+otherwise than the true one: true errors are counted after predictions are brought into the true world by the centres
+of the photos; the scale's error stays in what is found.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +33,8 @@ from cgwm.pipeline.calibrate import calibrate
 from cgwm.pipeline.evaluate.evaluation import EpisodeEvaluation
 from cgwm.pipeline.evaluate.stage import evaluate_model
 from cgwm.pipeline.fit import fit
-from cgwm.schemas import CalibrateConfig, CgwmError, PhysConfig, SplatConfig
+from cgwm.schemas import CalibrateConfig, CgwmError, InputDataError, PhysConfig, SplatConfig
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from store import Keyed, Store
 from tabletop import MATERIALS, make_capture
@@ -38,6 +42,7 @@ from tabletop.capture import TASKS, Task
 from tabletop.engines import refusal
 from tabletop.objects import load_item
 
+Array = NDArray[np.float64]
 OBJECTS = ("box", "l_block", "mustard_bottle", "mug")
 ENGINES = ("rapier", "dart", "mujoco")
 TESTS = 2
@@ -73,11 +78,14 @@ def drawn(seed: int) -> list[Job]:
 def measure(job: Job, folder: Path, device: str) -> dict[str, Any]:
     """Make a capture, fit a model, evaluate it by images, and return its episodes' errors beside the true ones."""
     root = folder / job.key.replace("/", "_")
+    frame = Frame()
     try:
         make_capture(root, job.object, job.material, job.task, job.seed, TESTS, engine=job.engine)
         if job.calibrated:
+            true = _photo_centers(root)
             (root / "cameras.json").unlink()
             calibrate(root, CalibrateConfig(seed=job.seed))
+            frame = Frame.between(true, _photo_centers(root))
         splats = SplatConfig(seed=job.seed, device=device)  # pyright: ignore[reportArgumentType]
         physics = PhysConfig(supervise="images", seed=job.seed, device=device)  # pyright: ignore[reportArgumentType]
         fit(root, root / "scene", stage="sg-gs", splat_config=splats)
@@ -85,27 +93,65 @@ def measure(job: Job, folder: Path, device: str) -> dict[str, Any]:
         found = evaluate_model(
             read_model(root / "model"), Capture.open(root, splits=("test",)), device=device, reference="images"
         )
-        rows = [episode_row(one, read_truth(root)) for one in found.episodes]
+        rows = [episode_row(one, read_truth(root), frame) for one in found.episodes]
     except CgwmError as error:
         return vars(job) | {"failed": error.found}
     finally:
         shutil.rmtree(root, ignore_errors=True)
-    return vars(job) | {"episodes": rows, "warnings": list(found.result.warnings)}
+    return vars(job) | {"frame": frame.record(), "episodes": rows, "warnings": list(found.result.warnings)}
 
 
-def episode_row(one: EpisodeEvaluation, truth: TruthFile) -> dict[str, Any]:
-    """Return the estimates of an episode and the true values of the same means."""
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Where the true world lies in that of the calibrated cameras: x_calibrated = scale * turn @ x_true + shift [m]."""
+
+    scale: float = 1.0
+    turn: Rotation = field(default_factory=Rotation.identity)
+    shift_m: Array = field(default_factory=lambda: np.zeros(3))
+
+    @staticmethod
+    def between(true_m: dict[str, Array], found_m: dict[str, Array]) -> Frame:
+        """Return the similarity that takes the true centres of photos to those found, by least squares."""
+        both = [name for name in found_m if name in true_m]
+        true, found = (np.stack([centers[name] for name in both]) for centers in (true_m, found_m))
+        arms, reached = true - true.mean(0), found - found.mean(0)
+        turn, _ = Rotation.align_vectors(reached, arms)
+        scale = float((reached * turn.apply(arms)).sum() / np.square(arms).sum())
+        return Frame(scale, turn, found.mean(0) - scale * turn.apply(true.mean(0)))
+
+    def to_true(self, position_m: Array, turn: Rotation) -> tuple[Array, Rotation]:
+        """Return positions (F, 3) [m] and rotations of the calibrated cameras' world in the true one."""
+        return self.turn.inv().apply(position_m - self.shift_m) / self.scale, self.turn.inv() * turn
+
+    def record(self) -> dict[str, float]:
+        """Return how large it is."""
+        shift, turn = float(1e3 * np.linalg.norm(self.shift_m)), float(np.degrees(self.turn.magnitude()))
+        return {"scale": round(self.scale, 5), "shift_mm": round(shift, 2), "turn_deg": round(turn, 3)}
+
+
+def _photo_centers(root: Path) -> dict[str, Array]:
+    """Return the centres of a capture's registered photos [m]."""
+    capture, centers = Capture.open(root), dict[str, Array]()
+    for name in capture.photos():
+        with contextlib.suppress(InputDataError):  # not registered
+            centers[name] = np.linalg.inv(capture.photo_camera(name).T_cam_world)[:3, 3]
+    return centers
+
+
+def episode_row(one: EpisodeEvaluation, truth: TruthFile, frame: Frame) -> dict[str, Any]:
+    """Return the estimates of an episode and the true values of the same means, with predictions in the true world."""
     prediction, errors, motion = one.prediction, one.errors, truth.episodes[one.prediction.episode]
     rows = np.abs(np.asarray(motion.time_s)[:, None] - prediction.time_s).argmin(0)
     place, turn = np.asarray(motion.position_m)[rows], _rotation(np.asarray(motion.quat_wxyz)[rows])
     found, after = prediction.predicted(), ~prediction.warmup
-    predicted, turned = found[0][:, 0], _rotation(found[1][:, 0])
-    alike = turn[0].inv() * _rotation(prediction.quat_wxyz[0, 0])
+    predicted, turned = frame.to_true(found[0][:, 0], _rotation(found[1][:, 0]))
+    tracked_m, tracked_turn = frame.to_true(prediction.position_m[:, 0], _rotation(prediction.quat_wxyz[:, 0]))
+    alike = turn[0].inv() * tracked_turn[0]
     if np.degrees(alike.magnitude()) < ALIKE_DEG:
         alike = Rotation.identity()
     com = np.asarray(truth.object.com_m)
     middles = predicted + turned.apply(alike.inv().apply(com)) - place - turn.apply(com)
-    tracked = prediction.position_m[:, 0] - place
+    tracked = tracked_m - place
     return {
         "episode": errors.episode,
         "true_m": _mean(predicted - place, after),
@@ -163,6 +209,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "table"))
     parser.add_argument("--seed", type=int, default=800)
+    parser.add_argument("--cameras", choices=("both", "true", "calibrated"), default="both", help="captures to take")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
     parser.add_argument("--seconds", type=float, help="begin none after this time")
@@ -174,7 +221,8 @@ def main() -> int:
     if given.what == "run":
         given.folder.mkdir(parents=True, exist_ok=True)
         folder = given.folder.resolve()
-        arguments = {job.key: (job, folder, given.device) for job in drawn(given.seed)}
+        jobs = [job for job in drawn(given.seed) if given.cameras in ("both", _KINDS[job.calibrated][0].split()[0])]
+        arguments = {job.key: (job, folder, given.device) for job in jobs}
         store.fill(measure, arguments, given.workers, given.seconds)
     print(table(store.results()))
     return 0
