@@ -7,22 +7,19 @@ keeps them on the device.
 from __future__ import annotations
 
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ...datasets.capture.cameras import Camera
 from ...datasets.models.model import Model
 from ...schemas import InputDataError, UsageError
-from ..geometry.rotation import quat_to_matrix
-from ..geometry.spheres import Spheres
 from ..physics.world import State
-from ..rendering.relighting import Relighting
+from ..rendering.posed_scene import LabelledModel
 from ..rendering.render import render
 from ..runtime import kernel_build
 
 
 class FrameRenderer:
-    """Renderer of all spheres of a model for one camera: static background, bodies at the poses of a state.
+    """Renderer of all spheres of a model for one camera: static background, moving bodies at the poses of a state.
 
     Args:
         model: A model with visual spheres.
@@ -34,27 +31,18 @@ class FrameRenderer:
     """
 
     def __init__(self, model: Model, camera: Camera, device: str) -> None:
-        def tensor(values: ArrayLike) -> Tensor:
-            return torch.as_tensor(values, dtype=torch.float32, device=device)
-
-        self._bodies: list[tuple[int, Spheres, Relighting | None]] = []
-        light = model.file.light
-        for index, body in enumerate(model.file.bodies):
-            if body.name in model.body_splats:
-                splats, relighting = model.body_splats[body.name], None
-                if light is not None and splats.normals is not None:
-                    relighting = Relighting.of(light, body, tensor(splats.normals))
-                self._bodies.append((index, Spheres.from_numpy(splats, device=device), relighting))
-        scene = [] if model.scene is None else [Spheres.from_numpy(model.scene, device=device)]
-        self._still = [spheres.seen_from(tensor(camera.center)) for spheres in scene]
-        if not self._bodies:
+        scene = LabelledModel(model, device)
+        if not scene.moving and not scene.fixed:
             raise InputDataError(
                 f"{model.root}: no body of the model has visual spheres, so there is nothing to see.",
                 todo="fit it from photos: cgwm fit CAPTURE --out MODEL.",
             )
-        everything = [*(spheres for _, spheres, _ in self._bodies), *self._still]
+        self._moving, self._still = scene.moving, scene.still(camera)
+        everything = [*(part.spheres for part in self._moving), self._still]
         self._scales = torch.cat([spheres.scales for spheres in everything])
         self._opacities = torch.cat([spheres.opacities for spheres in everything])
+        self._eye = scene.tensor(camera.center)[None]
+        tensor = scene.tensor
         self._viewmats, self._Ks = tensor(camera.T_cam_world)[None], tensor(camera.K)[None]
         self._size = (camera.width, camera.height)
         self._distortion = tensor(camera.distortion) if camera.distortion.any() else None
@@ -70,21 +58,14 @@ class FrameRenderer:
         Raises:
             UsageError: If the kernels are missing on a CUDA device.
         """
-        positions, rotations = state.position_m[0].float(), quat_to_matrix(state.quat_wxyz[0]).float()
-        means, colors = [], []
-        for index, spheres, relighting in self._bodies:
-            means.append(spheres.means @ rotations[index].T + positions[index])
-            color = spheres.colors
-            if relighting is not None:
-                color = (color * relighting.turned(rotations[index])[:, None]).clamp(0, 1)
-            colors.append(color)
-        means += [spheres.means for spheres in self._still]
-        colors += [spheres.colors for spheres in self._still]
+        positions, quats = state.position_m.float(), state.quat_wxyz.float()
+        placed = [part.placed(positions[:, part.body], quats[:, part.body]).view(0) for part in self._moving]
+        seen = [*(spheres.seen_from(self._eye) for spheres in placed), self._still]
         picture = render(
-            torch.cat(means),
+            torch.cat([spheres.means for spheres in seen]),
             self._scales,
             self._opacities,
-            torch.cat(colors),
+            torch.cat([spheres.colors for spheres in seen]),
             self._viewmats,
             self._Ks,
             *self._size,

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...schemas import Light
-from .relighting import brightness
+from .relighting import Relighting
 
 _NEIGHBOURS = 16
 _REACH = 3.0
@@ -50,10 +49,11 @@ class Edges:
         rows, nearest = rows.to(means.device), nearest.to(means.device)
         return Edges(rows, normals[rows], normals[nearest])
 
-    def placed(self, light: Light, rotations: Tensor) -> EdgeLight:
-        """Return the light on them at orientations (n, 3, 3)."""
+    def placed(self, relighting: Relighting, rotations: Tensor) -> EdgeLight:
+        """Return the light of a body's relighting on them at orientations (n, 3, 3)."""
         normals, others = (values @ rotations.mT for values in (self.normals, self.others))
-        return EdgeLight(self.rows, normals, (brightness(light, others) / brightness(light, normals))[..., None])
+        factors = relighting.brightness(others) / relighting.brightness(normals)
+        return EdgeLight(self.rows, normals, factors[..., None])
 
 
 @dataclass(frozen=True)

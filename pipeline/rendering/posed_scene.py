@@ -138,20 +138,19 @@ class _Moving:
     """Relighting of the spheres; None to keep the colours of the photos."""
     harmonics: Tensor | None = None
     """Harmonics of the colours from degree 1 on, body frame, shape (N, K, 3); None for colours equal from all sides."""
-    light: Light | None = None
-    """The light; None to keep the colours of the photos."""
     edges: Edges | None = None
-    """Spheres at the body's edges; None without a light or normals."""
+    """Spheres at the body's edges; None where no light was set or normals are unknown."""
 
     def placed(self, position_m: Tensor, quat_wxyz: Tensor) -> Labelled:
         """Return the spheres at positions (n, 3) [m] and orientations (n, 4)."""
         rotations = quat_to_matrix(quat_wxyz)
         means = self.spheres.means @ rotations.transpose(1, 2) + position_m[:, None]
         colors = self.spheres.colors.expand(len(means), -1, -1)
-        brightness = torch.ones_like(colors[..., :1])
+        brightness, edges = torch.ones_like(colors[..., :1]), None
         if self.relighting is not None:
             brightness = self.relighting.turned(rotations)[..., None]
             colors = (colors * brightness).clamp(0, 1)
+            edges = None if self.edges is None else self.edges.placed(self.relighting, rotations)
         return Labelled(
             means=means,
             scales=self.spheres.scales,
@@ -159,15 +158,15 @@ class _Moving:
             colors=colors,
             labels=self.spheres.labels,
             gloss=None if self.harmonics is None else Gloss(self.harmonics, rotations, brightness),
-            edges=None if self.edges is None or self.light is None else self.edges.placed(self.light, rotations),
+            edges=edges,
         )
 
     def lit(self, light: Light | None, body: BodyModel) -> _Moving:
         """Return the spheres under a light, or in the colours of the photos."""
         if light is None or self.normals is None:
-            return replace(self, relighting=None, light=None)
+            return replace(self, relighting=None)
         edges = self.edges or Edges.of(self.spheres.means, self.spheres.scales, self.normals)
-        return replace(self, relighting=Relighting.of(light, body, self.normals), light=light, edges=edges)
+        return replace(self, relighting=Relighting.of(light, body, self.normals), edges=edges)
 
 
 class LabelledModel:

@@ -28,11 +28,6 @@ def light_terms(normals: Tensor, lamp: Tensor) -> Tensor:
     return torch.cat((normals * (normals @ lamp > 0).to(normals)[..., None], normals[..., 2:]), -1)
 
 
-def brightness(light: Light, normals: Tensor) -> Tensor:
-    """Return the brightness L (N,) at unit normals (N, 3), world frame."""
-    return _brightness(_numbers(light, normals), normals)
-
-
 def _numbers(light: Light, like: Tensor) -> Tensor:
     return torch.tensor((*light.lamp, light.sky), dtype=like.dtype, device=like.device)
 
@@ -62,6 +57,10 @@ class Relighting:
     def factors(self, quat_wxyz: Tensor) -> Tensor:
         """Return the factors (N,) of the colours at an orientation (4,)."""
         return self.turned(quat_to_matrix(quat_wxyz))
+
+    def brightness(self, normals: Tensor) -> Tensor:
+        """Return the brightness L (...) at unit normals (..., 3), world frame."""
+        return _brightness(self.numbers, normals)
 
     def turned(self, rotation: Tensor) -> Tensor:
         """Return the factors (N,) of the colours at an orientation (3, 3), or (n, N) at n of them (n, 3, 3)."""

@@ -147,11 +147,12 @@ def test_a_driven_body_reaches_its_pose() -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_body_turns_in_its_light(device: str) -> None:
+def test_a_glossy_body_with_edges_turns_in_its_light(device: str) -> None:
     model = small_model()
     splats = model.body_splats["cube"]
-    outward = splats.means / np.linalg.norm(splats.means, axis=1, keepdims=True)
-    model = replace(model, body_splats={"cube": replace(splats, normals=outward)})
+    faces = np.where(np.abs(splats.means) < np.abs(splats.means).max(1, keepdims=True), 0.0, np.sign(splats.means))
+    glossy = 0.1 * np.random.default_rng(2).normal(size=(len(splats.means), 3, 3))
+    model = replace(model, body_splats={"cube": replace(splats, normals=faces, harmonics=glossy)})
     model = replace(model, file=model.file.model_copy(update={"light": Light(lamp=(0.8, 0.0, 0.3), sky=0.2)}))
     one = State(*(value[:, :1] for value in vars(start()).values()))
     loop = ClosedLoop(model, camera(), DT, device)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.rendering.edge_light import Edges
-from cgwm.pipeline.rendering.relighting import brightness
-from cgwm.schemas import Light
+from cgwm.pipeline.rendering.relighting import Relighting
+from cgwm.schemas import BodyModel, Light
 
 SCALE, LIGHT = 0.002, Light(lamp=(0.1, -0.2, 0.8), sky=0.2)
+BODY = BodyModel(name="a", motion="free", mass_kg=1, inertia_kg_m2=(1, 1, 1, 0, 0, 0), com_m=(0, 0, 0))
 UP, RIGHT = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
 
 
@@ -41,11 +42,12 @@ def test_a_sphere_of_the_hidden_side_is_as_bright_as_the_side_that_is_seen(turn:
     rotation = torch.tensor(
         [[np.cos(turn), 0.0, np.sin(turn)], [0.0, 1.0, 0.0], [-np.sin(turn), 0.0, np.cos(turn)]]
     ).float()
-    own = brightness(LIGHT, normals @ rotation.T)[:, None]
+    relighting = Relighting.of(LIGHT, BODY, normals)
+    own = relighting.brightness(normals @ rotation.T)[:, None]
     albedo, world = torch.tensor([0.2, 0.25, 0.3]), means @ rotation.T
-    placed = edges.placed(LIGHT, rotation[None]).view(0)
+    placed = edges.placed(relighting, rotation[None]).view(0)
     seen = placed.seen(own * albedo, world, rotation @ torch.tensor([-0.5, 0.0, 1.0]))  # from above, not from the side
-    top = brightness(LIGHT, (rotation @ UP)[None])
+    top = relighting.brightness((rotation @ UP)[None])
     changed = torch.zeros(len(means), dtype=torch.bool)
     changed[edges.rows] = normals[edges.rows, 0] > 0
     assert changed.sum() >= 6
@@ -53,7 +55,7 @@ def test_a_sphere_of_the_hidden_side_is_as_bright_as_the_side_that_is_seen(turn:
     assert torch.equal(seen[~changed], (own * albedo)[~changed])
     both = placed.seen(own * albedo, world, rotation @ torch.tensor([1.0, 0.0, 1.0]))  # both sides are seen
     assert torch.equal(both, own * albedo)
-    twice = edges.placed(LIGHT, torch.stack([rotation, torch.eye(3)]))  # views at once are as one by one
+    twice = edges.placed(relighting, torch.stack([rotation, torch.eye(3)]))  # views at once are as one by one
     eye = torch.tensor([-0.5, 0.0, 1.0])
     places = torch.stack([world, means])
     together = twice.seen((own * albedo).expand(2, -1, -1), places, eye)

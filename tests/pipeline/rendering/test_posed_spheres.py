@@ -17,7 +17,7 @@ from cgwm.pipeline.rendering.label_renderer import LabelRenderer, _exposed
 from cgwm.pipeline.rendering.posed_scene import Gloss, Labelled, LabelledModel, _Moving
 from cgwm.pipeline.rendering.rasterize import TILE as KERNEL_TILE
 from cgwm.pipeline.rendering.rasterize import Raster
-from cgwm.pipeline.rendering.relighting import DARKEST, Relighting, brightness
+from cgwm.pipeline.rendering.relighting import DARKEST, Relighting
 from cgwm.pipeline.rendering.render import MIN_ALPHA
 from cgwm.pipeline.rendering.screen_bounds import TILE, Box, inside, reach, spans
 from cgwm.schemas import Exposure, Light, Pose
@@ -174,17 +174,17 @@ def test_light_is_relative_to_that_of_the_photos() -> None:
     normals = torch.nn.functional.normalize(torch.randn(20, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     lamp = torch.tensor(light.lamp)
     wanted = 1 + 0.2 * normals[:, 2] + (normals @ lamp).clamp_min(0)
-    torch.testing.assert_close(brightness(light, normals), wanted)
-    dark = Light(lamp=(0.0, 0.0, 0.0), sky=1.0)
-    assert float(brightness(dark, -torch.eye(3))[2]) == pytest.approx(DARKEST)
     photo = quat_exp(torch.tensor([0.7, -0.3, 0.2]))
     pose = Pose(position_m=(0, 0, 0), quat_wxyz=tuple(photo.tolist()))
     body: Any = type("Body", (), {"photo_pose": pose})
     made = Relighting.of(light, body, normals)
+    torch.testing.assert_close(made.brightness(normals), wanted)
+    dark = Relighting.of(Light(lamp=(0.0, 0.0, 0.0), sky=1.0), body, normals)
+    assert float(dark.brightness(-torch.eye(3))[2]) == pytest.approx(DARKEST)
     torch.testing.assert_close(made.factors(photo), torch.ones(20))
     turn = quat_exp(torch.tensor([-0.5, 0.4, 1.0]))
     there, before = normals @ quat_to_matrix(turn).T, normals @ quat_to_matrix(photo).T
-    ratio = brightness(light, there) / brightness(light, before)
+    ratio = made.brightness(there) / made.brightness(before)
     torch.testing.assert_close(made.factors(turn), ratio)
     two = made.turned(torch.stack([quat_to_matrix(turn), quat_to_matrix(photo)]))
     torch.testing.assert_close(two, torch.stack([ratio, torch.ones(20)]))
