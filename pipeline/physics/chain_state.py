@@ -270,7 +270,7 @@ def _posed(
     for field, values_ in zip(fields, (position, quat, linear, quat_rotate(quat_conjugate(quat), omega)), strict=True):
         field[:, rows] = values_
     found = type(state)(*fields)
-    if chain.moving and _principal(chain, value):
+    if chain.moving and _versioned(found) and _principal(chain, value):
         _MADE[found.position_m] = _Made(chain.identity, _versions(found), value, speed)
     return found
 
@@ -284,8 +284,13 @@ def made_likewise(state: State, copy: State, copied: Callable[[Tensor], Tensor])
         copied: Function that copies a tensor likewise.
     """
     made = _MADE.get(state.position_m)
-    if made is not None and made.of(state) and copy.position_m is not state.position_m:
+    if made is not None and made.of(state) and _versioned(copy) and copy.position_m is not state.position_m:
         _MADE[copy.position_m] = _Made(made.chain, _versions(copy), copied(made.value), copied(made.speed))
+
+
+def _versioned(state: State) -> bool:
+    """Return whether it can be told that a state was changed in place; tensors of inference mode have no versions."""
+    return not any(part.is_inference() for part in state.tensors)
 
 
 def _versions(state: State) -> list[tuple[ref[Tensor], int]]:

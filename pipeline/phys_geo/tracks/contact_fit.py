@@ -71,6 +71,7 @@ from .contact_shooting import ShootingEpisodes, shoot_contact
 from .earlier_estimates import EarlierEstimates
 from .force_fit import with_forces
 from .inertia_fit import MASS_PARTS, fit_mass_distribution
+from .joint_fit import fit_joints
 from .measured_forces import measured_forces
 from .open_loop_search import ENOUGH_EPISODES, SearchBatch, open_loop_errors, search_contact
 from .part_choice import SCALE, asked_parts, choose_parts
@@ -138,7 +139,7 @@ def fit_physics(
         bounces=None if data.bounces is None else data.bounces.to_json(),
     )
     if data.airborne:
-        found = _never_touching(ready, batch, data.noise, record, earlier)
+        found = _never_touching(ready, batch, data, record, earlier)
     else:
         estimate, record = _contact_estimate(ready, data, batch, config, warm_started, record)
         if data.bounces is not None:
@@ -181,7 +182,7 @@ class _FitData:
     bounces: RestitutionFit | None
     """Restitution of the bounces of a ball, where its tracks have some and the law has a damping ratio for it."""
     airborne: bool
-    """Whether the only free body touches nothing in any of the frames."""
+    """Whether the only free body, or jointed bodies and all others touch nothing in any of the frames."""
 
     @staticmethod
     def of(world: World, episodes: Sequence[Episode], noise: tuple[float | None, float | None]) -> _FitData:
@@ -196,7 +197,7 @@ class _FitData:
         searched = [episodes[i] for i in chosen]
         spans = [_span(tracks) for _, tracks in searched]
         observations = Observations.of(world, searched, spans)
-        airborne = len(observations.free) == 1 and bool(
+        airborne = (len(observations.free) == 1 or bool(world.chains)) and bool(
             flight_frames(world, observations)[observations.seen[..., 0] > 0].all()
         )
         estimated = estimate_noise(free_tracks, airborne)
@@ -361,19 +362,30 @@ def _contact_estimate(
 
 
 def _never_touching(
-    ready: _Ready, batch: SearchBatch, noise: Noise, record: FitRecord, earlier: EarlierEstimates
+    ready: _Ready, batch: SearchBatch, data: _FitData, record: FitRecord, earlier: EarlierEstimates
 ) -> PhysicsFit:
-    """Return a fit with earlier contact parameters, or at their priors; a search would return the scatter of draws."""
+    """Return a fit with earlier contact parameters, or at their priors; a search would return the scatter of draws.
+
+    Jointed bodies move by what acts in their joints, which is fitted.
+    """
     names = ready.parameters
-    middle = np.array([p.encode(p.prior[0]) for p in names])
+    values, covariance = np.array([p.encode(p.prior[0]) for p in names]), np.diag([p.prior[1] ** 2 for p in names])
+    joints = chain_parameters(ready.world)
+    if joints:
+        note("phys-geo: joints")
+        rows = [names.index(parameter) for parameter in joints]
+        values[rows], covariance[np.ix_(rows, rows)] = fit_joints(
+            ready.world, data.searched, data.spans, joints, data.noise
+        )
     errors = open_loop_errors(ready.world, batch.observations, batch.warm, names)
-    record = replace(record, search_open_loop_m=[float(errors(middle[None]).mean())])
-    estimate = ContactEstimate(parameters=names, values=middle, covariance=np.diag([p.prior[1] ** 2 for p in names]))
+    record = replace(record, search_open_loop_m=[float(errors(values[None]).mean())])
+    estimate = ContactEstimate(parameters=names, values=values, covariance=covariance)
     estimate = earlier.kept_in(ready.world, estimate)
-    found = physics_fit(ready.world, estimate, noise, record)
+    found = physics_fit(ready.world, estimate, data.noise, record)
     unseen = any(parameter.state == "not_observable" for parameter in found.parameters)
     values = "prior" if not estimate.kept else "earlier or prior" if unseen else "earlier"
-    return replace(found, warnings=(NEVER_TOUCHES.format(values),))
+    of_joints = [parameter for parameter in found.parameters if parameter.name in {joint.name for joint in joints}]
+    return replace(found, warnings=(NEVER_TOUCHES.format(values), *bound_warnings(joints, of_joints)))
 
 
 def _completed(found: PhysicsFit, ready: _Ready) -> PhysicsFit:

@@ -78,7 +78,7 @@ def shoot_contact(
         config: The stage's settings.
     """
     parameters = _with_ground(world, names, ground_known)
-    prior = _prior(parameters)
+    prior = ShootingPrior.of(parameters)
     shots = _descended(
         world, data, parameters, _starts(parameters, prior, search, len(data.episodes)), prior, noise, config
     )
@@ -121,15 +121,6 @@ def _with_ground(world: World, names: Sequence[Parameter], ground_known: bool) -
     """Return the parameters of the search, with the height of the ground if it has not been fitted."""
     lacking = world.ground_normal is not None and GROUND_SHIFT not in names and not ground_known
     return [*names, GROUND_SHIFT] if lacking else list(names)
-
-
-def _prior(parameters: Sequence[Parameter]) -> ShootingPrior:
-    """Return the prior of parameters (P) in fitted coordinates."""
-    return ShootingPrior(
-        torch.as_tensor(np.array([p.encode(p.prior[0]) for p in parameters])),
-        torch.tensor([p.prior[1] for p in parameters], dtype=torch.float64),
-        torch.tensor([p.limits for p in parameters], dtype=torch.float64),
-    )
 
 
 def _starts(

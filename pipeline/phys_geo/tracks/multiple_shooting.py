@@ -31,7 +31,7 @@ from ...physics.world import State, World
 from ...trajectories.observations import Observations
 from ...trajectories.residuals import retract, state_prior
 from ...trajectories.track_noise import Noise
-from .shooting_segments import Chains, TiedSegments
+from .shooting_segments import SEGMENT_S, Chains, TiedSegments
 
 TIE = (5e-5, 5e-4, 1e-3, 1e-2)
 """Standard deviation of a tie over flight: position [m], rotation [rad], velocity [m/s], angular velocity [rad/s]."""
@@ -63,6 +63,15 @@ class ShootingPrior:
     """Standard deviation, shape (P,)."""
     bounds: Tensor
     """Lower and upper bound, shape (P, 2)."""
+
+    @staticmethod
+    def of(parameters: Sequence[Parameter]) -> ShootingPrior:
+        """Return the priors of parameters (P)."""
+        return ShootingPrior(
+            torch.tensor([p.encode(p.prior[0]) for p in parameters], dtype=torch.float64),
+            torch.tensor([p.prior[1] for p in parameters], dtype=torch.float64),
+            torch.tensor([p.limits for p in parameters], dtype=torch.float64),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,13 +135,14 @@ class Shooting:
         noise: Noise,
         prior: ShootingPrior,
         contacts_only: bool = False,
+        segment_s: float = SEGMENT_S,
     ) -> Shooting:
-        """Cut the span [s] of each episode into segments.
+        """Cut the span [s] of each episode into segments of at least `segment_s`; infinite, it is one.
 
         With `contacts_only`, segments without information on contact are left out: in flight or at rest, and not next
         to a segment with such information. The first segments stay, because episodes begin with their states.
         """
-        tied = TiedSegments.of(world, episodes, spans, noise, contacts_only)
+        tied = TiedSegments.of(world, episodes, spans, noise, contacts_only, segment_s)
         like = world.gravity
         return Shooting(
             world=world,
@@ -184,6 +194,10 @@ class Shooting:
             shots.append(tied._minimised(shot.shared, states, continued or iterations)[0])
             done()
         return sorted(shots, key=lambda shot: shot.cost)
+
+    def descended(self, shared: Tensor, iterations: int) -> ShootingFit:
+        """Minimise the cost of segments without ties from a start of the parameters (P,)."""
+        return self._minimised(shared, self.segments.state, iterations)[0]
 
     def _minimised(self, shared: Tensor, states: State, iterations: int) -> tuple[ShootingFit, State]:
         problem = _TiedProblem(self)

@@ -52,10 +52,11 @@ class TiedSegments:
         spans: Sequence[tuple[float, float]],
         noise: Noise,
         contacts_only: bool,
+        segment_s: float = SEGMENT_S,
     ) -> TiedSegments:
         """Cut the span [s] of each episode into segments; see `Shooting.of`."""
         whole = Observations.of(world, episodes, spans)
-        pieces = _pieces(world, whole, noise, contacts_only)
+        pieces = _pieces(world, whole, noise, contacts_only, segment_s)
         items = [k for k, _, _ in pieces]
         windows = [(float(whole.times_s[k, a]) - 1e-9, float(whole.times_s[k, b]) + 1e-9) for k, a, b in pieces]
         segments = Observations.of(world, [episodes[k] for k in items], windows)
@@ -171,9 +172,9 @@ class Chains:
         )
 
 
-def _pieces(world: World, whole: Observations, noise: Noise, contacts_only: bool) -> list[_Piece]:
+def _pieces(world: World, whole: Observations, noise: Noise, contacts_only: bool, segment_s: float) -> list[_Piece]:
     """Return the segments of episodes; with `contacts_only` those near contact, and the first of each episode."""
-    cuts = [_cuts(times[:count]) for times, count in zip(whole.times_s, whole.frames.tolist(), strict=True)]
+    cuts = [_cuts(times[:count], segment_s) for times, count in zip(whole.times_s, whole.frames.tolist(), strict=True)]
     pieces = [(k, a, b) for k, places in enumerate(cuts) for a, b in itertools.pairwise(places)]
     if not contacts_only:
         return pieces
@@ -181,11 +182,11 @@ def _pieces(world: World, whole: Observations, noise: Noise, contacts_only: bool
     return [piece for piece, near in zip(pieces, informative, strict=True) if near or piece[1] == 0]
 
 
-def _cuts(times_s: Tensor) -> list[int]:
+def _cuts(times_s: Tensor, segment_s: float) -> list[int]:
     """Return the frames at which segments begin, and the last frame."""
     places = [0]
     for frame in range(1, len(times_s)):
-        if float(times_s[frame] - times_s[places[-1]]) >= SEGMENT_S:
+        if float(times_s[frame] - times_s[places[-1]]) >= segment_s:
             places.append(frame)
     if len(places) > 2 and places[-1] != len(times_s) - 1:
         places.pop()  # the last segment absorbs a remainder that is too short

@@ -110,17 +110,21 @@ def test_poses_mass_matrix_and_forces_are_those_of_mujoco(base: str) -> None:
         np.testing.assert_allclose(bias, turn.T @ data.qfrc_bias, atol=1e-11)
 
 
-def test_values_are_read_from_poses_and_written_into_them() -> None:
-    chain, bodies, _ = tree("free", torch.Generator().manual_seed(5))
-    world = chained(chain, *bodies, ground=False)
-    given, speeds = {"j1": 2.0, "j2": -0.2, "j4": -3.0}, {"j1": 0.5, "j2": 0.3, "j4": -0.7}
-    state = with_joints(world, still(5), given, speeds)
-    values, rates = joints_of(world, state, chain)
-    np.testing.assert_allclose(values[0], list(given.values()), atol=1e-14)
-    np.testing.assert_allclose(rates[0], list(speeds.values()), atol=1e-14)
-    around = replace(chain, joints=(replace(chain.joints[0], lower=batch(2.5), upper=batch(6.5)), *chain.joints[1:]))
-    turned = with_joints(replace(world, chains=(around,)), still(5), {"j1": 6.0})
-    np.testing.assert_allclose(joints_of(world, turned, around)[0][0, 0], 6.0, atol=1e-14)
+@pytest.mark.parametrize("inference", [False, True])  # as a fit, in which tensors have no versions
+def test_values_are_read_from_poses_and_written_into_them(inference: bool) -> None:
+    with torch.inference_mode(inference):
+        chain, bodies, _ = tree("free", torch.Generator().manual_seed(5))
+        world = chained(chain, *bodies, ground=False)
+        given, speeds = {"j1": 2.0, "j2": -0.2, "j4": -3.0}, {"j1": 0.5, "j2": 0.3, "j4": -0.7}
+        state = with_joints(world, still(5), given, speeds)
+        values, rates = joints_of(world, state, chain)
+        np.testing.assert_allclose(values[0], list(given.values()), atol=1e-14)
+        np.testing.assert_allclose(rates[0], list(speeds.values()), atol=1e-14)
+        around = replace(
+            chain, joints=(replace(chain.joints[0], lower=batch(2.5), upper=batch(6.5)), *chain.joints[1:])
+        )
+        turned = with_joints(replace(world, chains=(around,)), still(5), {"j1": 6.0})
+        np.testing.assert_allclose(joints_of(world, turned, around)[0][0, 0], 6.0, atol=1e-14)
 
 
 def test_a_floating_chain_keeps_its_momentum_and_its_energy() -> None:

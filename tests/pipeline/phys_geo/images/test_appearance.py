@@ -21,11 +21,15 @@ from cgwm.pipeline.phys_geo.images.lighting_fit import (
     _rendered,
     fit_light,
 )
-from cgwm.pipeline.rendering.relighting import Relighting, brightness
+from cgwm.pipeline.rendering.relighting import Relighting
 from cgwm.schemas import Light
 from helpers.small_model import small_model
 
 LIGHT = Light(lamp=(0.3, -0.4, 0.7), sky=0.15)
+
+
+def brightness(light: Light, normals: torch.Tensor) -> torch.Tensor:
+    return Relighting.of(light, small_model().file.bodies[0], normals).brightness(normals)
 
 
 def _directions(count: int, seed: int) -> np.ndarray:

@@ -1,0 +1,52 @@
+"""Losses in joints, masses and inertia of jointed bodies that touch nothing, from their whole motions.
+
+Between contacts the motion is a smooth function of its start and of these numbers, so that each episode is one segment,
+without ties. Damping and friction of a joint change little within a segment of shooting, and much over a whole swing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ....datasets.capture.tracks import Episode
+from ...physics.parameters import Parameter
+from ...physics.world import World
+from ...trajectories.track_noise import Noise
+from .multiple_shooting import Shooting, ShootingPrior
+from .tempered_posterior import tempered
+
+SHARES = (0.125, 0.25, 0.5, 1.0)
+"""Parts of an episode that are fitted one after the other: over a short one the priors lead to the minimum."""
+ITERATIONS = 30
+"""Limit on steps for each of them."""
+
+
+def fit_joints(
+    world: World,
+    episodes: Sequence[Episode],
+    spans: Sequence[tuple[float, float]],
+    parameters: Sequence[Parameter],
+    noise: Noise,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return parameters (P,) of jointed bodies and their covariance (P, P), in fitted coordinates.
+
+    Args:
+        world: The world.
+        episodes: Name and tracks by body of each episode.
+        spans: Start and end of the part of each episode that is fitted [s].
+        parameters: The parameters.
+        noise: Of the tracks (position [m], rotation [rad]).
+    """
+    prior = ShootingPrior.of(parameters)
+    shared, fit = prior.mean, None
+    for share in SHARES:
+        parts = [(start, start + share * (end - start)) for start, end in spans]
+        problem = Shooting.of(world, parameters, episodes, parts, noise, prior, segment_s=math.inf)
+        fit = problem.descended(shared, ITERATIONS)
+        shared = fit.shared
+    assert fit is not None
+    values, covariance, _ = tempered(fit, prior, 0.0)  # without ties there is no misfit of them
+    return values, covariance
