@@ -21,7 +21,7 @@ from ...schemas import GroundShadow
 from ..geometry.ground_spheres import NODE_WEIGHTS, NODES, THIN, dimmed, on_plane
 from ..geometry.solid_grid import Array
 from ..geometry.spheres import Spheres
-from .cast_shadow import CastShadow, find_shadow
+from .cast_shadow import Caster, CastShadow, find_shadow
 from .context import Stage
 from .ground_photo import CELLS, GroundPhoto, photograph_ground
 from .initialization import to_spheres
@@ -56,15 +56,17 @@ def bare_ground(stage: Stage, scene: Spheres, bodies: list[Spheres]) -> BareGrou
     """
     if stage.ground is None or not bodies:
         return BareGround(scene, None)
-    solid = [_outline(body) for body in bodies]
+    casters = [Caster(*_places(body)) for body in bodies]
+    solid = [caster.corners for caster in casters]
     even = [stage.exposures.even(view) for view in stage.train]
     photo = photograph_ground(stage.ground, np.concatenate(solid), even)
     if photo is None:
         return BareGround(scene, None)
-    shadow = find_shadow(photo, solid)
+    shadow = find_shadow(photo, casters)
     hidden = _hidden(photo, solid)
     lit = photo.colors if shadow is None else photo.colors / dimmed(shadow.cover, shadow.factors).astype(np.float32)
     bare = _inpainted(lit, photo.seen, hidden)
+    scene = _without_insides(scene, solid)
     if shadow is not None:
         scene = _lifted(scene, photo, shadow)
     scene = _filled(scene, photo, hidden, bare)
@@ -79,12 +81,23 @@ def _for_model(shadow: CastShadow) -> GroundShadow:
     return GroundShadow(to_lamp=(x, y, z), brightness_rgb=(red, green, blue))
 
 
-def _outline(body: Spheres) -> Array:
-    """Return the corners of a body, world frame [m], (n, 3): of the hull of points one scale from its centres."""
-    means, scales = (values.detach().cpu().numpy().astype(float) for values in (body.means, body.scales))
-    ways = np.concatenate([np.eye(3), -np.eye(3)])
-    points = (means[:, None] + scales[:, None, None] * ways).reshape(-1, 3)
-    return points[ConvexHull(points).vertices]
+def _places(spheres: Spheres) -> tuple[Array, Array]:
+    """Return the centres (n, 3) [m] and the scales (n,) [m] of spheres."""
+    means, scales = (values.detach().cpu().numpy().astype(float) for values in (spheres.means, spheres.scales))
+    return means, scales
+
+
+def _without_insides(scene: Spheres, bodies: list[Array]) -> Spheres:
+    """Return the background without spheres that lie within the hull of a body's corners, to one scale of theirs.
+
+    Photos show them at most through the body, so that they have its colours.
+    """
+    means, scales = _places(scene)
+    inside = np.zeros(len(scales), bool)
+    for corners in bodies:
+        planes = ConvexHull(corners).equations
+        inside |= (means @ planes[:, :3].T + planes[:, 3] < scales[:, None]).all(1)
+    return _rows(scene, torch.as_tensor(np.flatnonzero(~inside), device=scene.means.device))
 
 
 def _hidden(photo: GroundPhoto, bodies: list[Array]) -> NDArray[np.bool_]:
@@ -114,7 +127,7 @@ def _lifted(scene: Spheres, photo: GroundPhoto, shadow: CastShadow) -> Spheres:
 
     A sphere is in the shadow by the share of its weight there: the cover under nine points of it.
     """
-    means, scales = scene.means.detach().cpu().numpy().astype(float), scene.scales.detach().cpu().numpy().astype(float)
+    means, scales = _places(scene)
     ground = _of_ground(means, scales, photo)
     cover = np.zeros(len(scales))
     for i, u in enumerate(NODES):
@@ -146,7 +159,7 @@ def _at(grid: NDArray[np.float32], places: Array) -> Array:
 
 def _filled(scene: Spheres, photo: GroundPhoto, hidden: NDArray[np.bool_], bare: NDArray[np.float32]) -> Spheres:
     """Return the background with hidden ground covered by small spheres, in place of those that lie in it."""
-    means, scales = scene.means.detach().cpu().numpy().astype(float), scene.scales.detach().cpu().numpy().astype(float)
+    means, scales = _places(scene)
     inner = cv2.erode(hidden.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
     gone = (_at(inner, photo.places(means)) > 0.5) & _of_ground(means, scales, photo)
     rows, columns = np.nonzero(hidden)

@@ -1,19 +1,22 @@
 """The shadow that bodies cast on the ground in the photos: found by its shape, and how much darker it is.
 
 One lamp far away darkens the ground where a body is before it, by one factor for each colour channel. The direction of
-the lamp is that whose shadow separates the ground best into a dark and a bright part (Otsu's criterion, 1979), and is
-taken if the same search with the bodies moved to other places of the ground finds nothing nearly as dark: textures have
-dark places, too.
+the lamp is that whose shadow, of the bodies' hulls, separates the ground best into a dark and a bright part (Otsu's
+criterion, 1979). It is taken if the same search with the bodies moved to other places of the ground finds nothing
+nearly as dark: textures have dark places, too. The shadow itself is that of the bodies, in whose notches the ground is
+lit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from ..geometry.solid_grid import Array
 from .ground_photo import CELLS, GroundPhoto
@@ -33,6 +36,11 @@ _TINT_STD = 0.05
 """Standard deviation of the logarithm of a channel's factor about the mean of the channels: shadows are nearly grey."""
 _OUTLYING = 2.5
 
+_FINER = 2
+"""Parts of a cell, along and across, in which the shadows of spheres are drawn."""
+_HALF_ALPHA = float(np.sqrt(2 * np.log(2)))
+"""Distance from the middle of an opaque sphere at which its alpha is a half, in scales."""
+
 Angles = tuple[float, float]
 """Azimuth and elevation of a lamp [deg], in the axes of the ground."""
 
@@ -51,27 +59,41 @@ class CastShadow:
     """Its value of Otsu's criterion over the largest that the same search finds elsewhere."""
 
 
-def find_shadow(photo: GroundPhoto, bodies: Sequence[Array]) -> CastShadow | None:
-    """Return the shadow of bodies on the ground, or None if none stands out.
+@dataclass(frozen=True, eq=False)
+class Caster:
+    """A body that casts a shadow: spheres on its surface."""
 
-    Args:
-        photo: The ground.
-        bodies: Points of the surface of each body, world frame [m], shape (n, 3).
-    """
+    means: Array
+    """Their centres, world frame [m], shape (n, 3)."""
+    scales: Array
+    """Their scales [m], shape (n,)."""
+
+    @cached_property
+    def corners(self) -> Array:
+        """Return the corners of the hull of points one scale from the centres [m], shape (m, 3)."""
+        ways = np.concatenate([np.eye(3), -np.eye(3)])
+        points = (self.means[:, None] + self.scales[:, None, None] * ways).reshape(-1, 3)
+        return points[ConvexHull(points).vertices]
+
+
+def find_shadow(photo: GroundPhoto, bodies: Sequence[Caster]) -> CastShadow | None:
+    """Return the shadow of bodies on the ground, or None if none stands out."""
     usable = photo.seen
     if usable.sum() < 2 * _LEAST_CELLS:
         return None
     light = _light(photo, usable)
-    criterion = _Criterion(photo, bodies, light, usable)
+    hulls = [body.corners for body in bodies]
+    criterion = _Criterion(photo, hulls, light, usable)
     angles = criterion.refined(criterion.coarse())
     cover = _cover(photo, bodies, angles)
     inside = (cover > 0.5) & usable
     if not _LEAST_CELLS <= inside.sum() < usable.sum() - _LEAST_CELLS:
         return None
-    rest = usable & (cv2.dilate(cover, np.ones((3, 3))) < 0.02)
+    around = np.maximum(cover, _hull_cover(photo, hulls, angles))
+    rest = usable & (cv2.dilate(around, np.ones((3, 3))) < 0.02)
     elsewhere = []
-    for shift in _shifts(photo, bodies, cover):
-        moved = _Criterion(photo, [points + shift for points in bodies], light, rest)
+    for shift in _shifts(photo, hulls, cover):
+        moved = _Criterion(photo, [points + shift for points in hulls], light, rest)
         elsewhere.append(moved.value(moved.coarse()))
     contrast = criterion.value(angles) / max([1e-9, *elsewhere])
     factors = _factors(photo, inside, rest)
@@ -91,8 +113,8 @@ def _light(photo: GroundPhoto, usable: NDArray[np.bool_]) -> Array:
 class _Criterion:
     """Otsu's criterion of the shadow of bodies, by the direction of the lamp: the variance between dark and bright."""
 
-    def __init__(self, photo: GroundPhoto, bodies: Sequence[Array], light: Array, usable: NDArray[np.bool_]) -> None:
-        self._photo, self._bodies = photo, bodies
+    def __init__(self, photo: GroundPhoto, hulls: Sequence[Array], light: Array, usable: NDArray[np.bool_]) -> None:
+        self._photo, self._hulls = photo, hulls
         self._weights = usable.astype(np.float32).ravel()
         self._values = ((light - light[usable].mean()) * usable).astype(np.float32).ravel()
         self._count = float(self._weights.sum())
@@ -101,7 +123,7 @@ class _Criterion:
         """Return the criterion; 0 where the shadow is brighter than the rest, or too small."""
         if not 5.0 <= angles[1] <= 89.0:
             return 0.0
-        inside = _cover(self._photo, self._bodies, angles).ravel()
+        inside = _hull_cover(self._photo, self._hulls, angles).ravel()
         count, dark = float(inside @ self._weights), float(inside @ self._values)
         if not _LEAST_CELLS <= count <= self._count - _LEAST_CELLS or dark >= 0:
             return 0.0
@@ -147,16 +169,37 @@ def _direction(photo: GroundPhoto, angles: Angles) -> Array:
     return np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)]) @ photo.axes
 
 
-def _cover(photo: GroundPhoto, bodies: Sequence[Array], angles: Angles) -> NDArray[np.float32]:
-    """Return the share of each cell in the shadow: the hull of each body's points, moved along the light."""
-    to_lamp = _direction(photo, angles)
+def _hull_cover(photo: GroundPhoto, hulls: Sequence[Array], angles: Angles) -> NDArray[np.float32]:
+    """Return the share of each cell in the shadow of hulls, each given by points (n, 3) [m]."""
     image = np.zeros((CELLS, CELLS), np.uint8)
-    for points in bodies:
-        above = points @ photo.axes[2] - photo.height
-        cells = photo.places(points - (above / (to_lamp @ photo.axes[2]))[:, None] * to_lamp)
-        hull = cv2.convexHull(cells.astype(np.float32))
+    for points in hulls:
+        hull = cv2.convexHull(_fallen(photo, points, angles).astype(np.float32))
         cv2.fillConvexPoly(image, np.round((hull - 0.5) * 16).astype(np.int32), 255, cv2.LINE_AA, 4)
     return (image / np.float32(255)).astype(np.float32)
+
+
+def _cover(photo: GroundPhoto, bodies: Sequence[Caster], angles: Angles) -> NDArray[np.float32]:
+    """Return the share of each cell in the shadow of bodies: discs for their spheres, moved along the light."""
+    fine = _FINER * CELLS
+    image = np.zeros((fine, fine), np.uint8)
+    for body in bodies:
+        cells = np.floor(_FINER * _fallen(photo, body.means, angles)).astype(int)
+        radii = np.round(_FINER * _HALF_ALPHA * body.scales / photo.cell).astype(int).clip(max=fine // 4)
+        inside = ((cells >= 0) & (cells < fine)).all(1)
+        for radius in np.unique(radii[inside]):
+            part = np.zeros_like(image)
+            chosen = cells[inside & (radii == radius)]
+            part[chosen[:, 1], chosen[:, 0]] = 255
+            image |= cv2.dilate(part, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(radius) + 1,) * 2))
+    closed = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((2 * _FINER + 1,) * 2, np.uint8))
+    return cv2.resize(closed.astype(np.float32) / 255, (CELLS, CELLS), interpolation=cv2.INTER_AREA)
+
+
+def _fallen(photo: GroundPhoto, points: Array, angles: Angles) -> Array:
+    """Return the cells (n, 2) on which the shadows of points (n, 3) [m] fall."""
+    to_lamp = _direction(photo, angles)
+    above = points @ photo.axes[2] - photo.height
+    return photo.places(points - (above / (to_lamp @ photo.axes[2]))[:, None] * to_lamp)
 
 
 def _shifts(photo: GroundPhoto, bodies: Sequence[Array], cover: NDArray[np.float32]) -> list[Array]:

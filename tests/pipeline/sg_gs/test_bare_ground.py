@@ -9,13 +9,22 @@ import torch
 from cgwm.pipeline.geometry.ground_spheres import on_plane
 from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.sg_gs import bare_ground as ground_module
-from cgwm.pipeline.sg_gs.cast_shadow import find_shadow
+from cgwm.pipeline.sg_gs.cast_shadow import Caster, _cover, find_shadow
 from cgwm.pipeline.sg_gs.ground_photo import CELLS, GroundPhoto
 
 CELL, HALF = 0.004, np.array([0.06, 0.04, 0.05])
 BOX = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3) * HALF + [0, 0, HALF[2]]
 TO_LAMP = np.array([0.5, 0.3, 0.8]) / np.linalg.norm([0.5, 0.3, 0.8])
 FACTORS = np.array([0.62, 0.64, 0.66])
+
+
+def _caster(corners: np.ndarray) -> Caster:
+    """Return a box of given corners as spheres of 1 mm on its surface, 4 mm apart."""
+    low, high = corners.min(0), corners.max(0)
+    axes = [np.linspace(a, b, round((b - a) / 0.004) + 1) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes), -1).reshape(-1, 3)
+    points = points[(np.isclose(points, low) | np.isclose(points, high)).any(1)]
+    return Caster(points, np.full(len(points), 0.001))
 
 
 def _polygon(points: np.ndarray) -> np.ndarray:
@@ -44,7 +53,7 @@ def _photo(seed: int, shaded: bool) -> GroundPhoto:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_lamp_is_found_by_the_shadow_of_the_body(seed: int) -> None:
-    shadow = find_shadow(_photo(seed, shaded=True), [BOX])
+    shadow = find_shadow(_photo(seed, shaded=True), [_caster(BOX)])
     assert shadow is not None
     assert np.degrees(np.arccos(shadow.to_lamp @ TO_LAMP)) < 3
     assert shadow.factors == pytest.approx(FACTORS, abs=0.06)  # a median of some 100 independent speckles of 20 %
@@ -54,12 +63,31 @@ def test_the_lamp_is_found_by_the_shadow_of_the_body(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [0, 4])
 def test_no_shadow_is_seen_in_a_texture(seed: int) -> None:
-    assert find_shadow(_photo(seed, shaded=False), [BOX]) is None
+    assert find_shadow(_photo(seed, shaded=False), [_caster(BOX)]) is None
+
+
+def test_the_ground_in_a_notch_is_not_in_the_shadow() -> None:
+    arms = [np.array([[-0.06, -0.06, 0.0], [0.06, -0.02, 0.06]]), np.array([[-0.06, -0.02, 0.0], [-0.02, 0.06, 0.06]])]
+    parts = [_caster(arm) for arm in arms]
+    body = Caster(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("means", "scales")))
+    photo = _photo(0, shaded=False)
+    cover = _cover(photo, [body], (0.0, 89.0))  # from nearly above
+    columns, rows = np.floor(photo.places(np.array([[0.03, 0.03, 0.0], [0.03, -0.04, 0.0], [-0.04, 0.03, 0.0]]))).T
+    assert cover[rows.astype(int), columns.astype(int)] == pytest.approx([0, 1, 1])
+    area, outline = 0.12 * 0.04 + 0.04 * 0.08, 0.48
+    assert area < cover.sum() * CELL**2 < area + CELL * outline  # discs reach beyond the outline
+
+
+def test_what_lies_within_a_body_leaves_the_background() -> None:
+    places = [[0, 0, 0.05], [0.059, 0, 0.05], [0.0605, 0, 0.05], [0.07, 0, 0.05], [0, 0, 0.2]]
+    scene = Spheres(torch.tensor(places), torch.full((5,), 1e-3), torch.full((5,), 0.9), torch.rand(5, 3))
+    kept = ground_module._without_insides(scene, [BOX])
+    assert torch.equal(kept.means, scene.means[3:])
 
 
 def test_the_shadow_is_lifted_from_the_ground_alone_and_hidden_ground_is_covered() -> None:
     photo = _photo(0, shaded=True)
-    shadow = find_shadow(photo, [BOX])
+    shadow = find_shadow(photo, [_caster(BOX)])
     assert shadow is not None
     rows, columns = (values.ravel() for values in np.meshgrid(np.arange(0, CELLS, 4), np.arange(0, CELLS, 4)))
     points = photo.points(np.stack([columns + 0.5, rows + 0.5], 1))
