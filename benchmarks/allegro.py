@@ -6,8 +6,10 @@ python benchmarks/allegro.py table
 FOLDER is asu-iris/Complementarity-Free-Dexterous-Manipulation at 87b320f (no licence: to be read and run only), whose
 scenes are the plant, without their textures. Start, goal and success are those of its `examples/mpc/allegro`: a random
 turn about the vertical, a goal 90 degrees to one side, reached where 1 - (q . q*)^2 < 0.04 (23.1 degrees) at more than
-20 commands of 0.1 s in a row within 500; position is not asked, but given. The plant waits for plans. MuJoCo is the
-installed one (their tables are with 3.2.0), where meshes collide as their hulls, as in predictions.
+20 commands of 0.1 s in a row within 500; position is not asked, but given. The plant waits for plans. With `--mujoco
+PACKAGES`, a folder that `pip install --no-deps --target PACKAGES mujoco==3.2.0` makes, the plant runs in a process of
+its own under that MuJoCo, with which their tables were made; without it under the installed one. Meshes collide as
+their hulls, as in predictions.
 """
 
 from __future__ import annotations
@@ -16,8 +18,6 @@ import argparse
 import importlib
 import math
 import os
-import re
-import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from allegro_scenes import resized, scene_of
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import run_hand
@@ -35,6 +36,7 @@ from cgwm.pipeline.runtime.resources import no_garbage_search
 from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
 from cgwm.schemas import ContactParameters, HandTask
 from known_object import SPREAD, errors_of, known_object, sensing_of
+from plant_process import PipedPlant
 from store import Store
 
 mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs
@@ -53,32 +55,6 @@ PLACES = {
     "stick": ((-0.01, 0.0, 0.03), (-0.01, 0.0, 0.03), (math.pi / 4, math.pi / 2), (-1, 1)),
 }
 """By object: mean place at the start and wanted place [m], first turn and range of turns [rad], sides to choose."""
-
-
-def scene_of(repository: Path, folder: Path, name: str) -> Path:
-    """Copy the files of a scene without textures, and return the scene."""
-    shutil.copytree(repository / "envs", folder / "envs", dirs_exist_ok=True)
-    scene = folder / "envs" / "xmls" / f"env_allegro_{name}.xml"
-    text = re.sub(r"<(texture|material)\b[^>]*/>", "", scene.read_text(encoding="utf-8"))
-    scene.write_text(re.sub(r'\bmaterial="[^"]*"', "", text), encoding="utf-8")
-    return scene
-
-
-def resized(scene: Path, factor: float) -> Path:
-    """Write a scene whose object has another size and the same mass beside a scene, and return it."""
-    if factor == 1.0:
-        return scene
-
-    def times(found: re.Match[str]) -> str:
-        return found[1] + " ".join(str(factor * float(number)) for number in found[2].split()) + found[3]
-
-    text = scene.read_text(encoding="utf-8")
-    text = re.sub(r'(<mesh name="object" (?![^>]*scale)[^>]*?)(/>)', r'\1 scale="1 1 1"\2', text)
-    text = re.sub(r'(<mesh name="object" [^>]*scale=")([^"]*)(")', times, text)
-    text = re.sub(r'(<geom name="obj" type="box" [^>]*size=")([^"]*)(")', times, text)
-    made = scene.with_name(f"{scene.stem}_times_{factor:g}.xml")
-    made.write_text(text, encoding="utf-8")
-    return made
 
 
 def model_of(scene: Path, corners: int, spread: float = 0.0) -> Model:
@@ -162,8 +138,11 @@ def measure(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
     goal = task.goal.model_copy(update={"position_m": PLACES[scene.stem.removeprefix("env_allegro_")][1]})
     controller.task = task.model_copy(update={"goal": goal})
     controller.hand = replace(controller.hand, task=controller.task)
+    plant = PipedPlant(controller.hand, given.mujoco) if given.mujoco else HandScenePlant(controller.hand)
     with no_garbage_search():
-        found = run_hand(controller, HandScenePlant(controller.hand), seed, "ideal")
+        found = run_hand(controller, plant, seed, "ideal")
+    if isinstance(plant, PipedPlant):
+        plant.close()
     cpu = 1e3 * found.column("cpu_s", "plans")
     return {
         "ended": found.ended,
@@ -210,6 +189,7 @@ def main() -> None:
     parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
     parser.add_argument("--draws", type=int, default=0, help="of friction, whose standard error is 70 %% then")
     parser.add_argument("--lift", type=float, default=0.0, help="height above the start of the repository [m]")
+    parser.add_argument("--mujoco", type=Path, default=None, help="packages of the plant's own process")
     parser.add_argument("--store", type=Path, default=None)
     parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
     given = parser.parse_args()
@@ -228,6 +208,7 @@ def main() -> None:
                 size = f"{given.hz:g} Hz, {given.samples} x {given.horizon:g} s in steps of {1e3 * given.step:g} ms"
                 size += f", {given.plant}" if given.plant else ""
                 size += f", {given.draws} draws" if given.draws else ""
+                size += f", {given.mujoco.name}" if given.mujoco else ""
                 store.result(f"{thing}, {size}/{seed}", lambda c=scene, s=seed: measure(folder, c, s, given))
 
 
