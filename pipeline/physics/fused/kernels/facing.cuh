@@ -111,6 +111,15 @@ struct Near {  // edges of a hull that are near another one; all of them where m
     }
 };
 
+#if HOST
+const int MET_ROOM = 64;
+struct Met {  // edges of two hulls that may be a contact, without derivatives
+    int edge, other;  // of a, and the number of the near edge of b
+    bool leaves;      // as `edge_leaves`
+    Number gap, normal[3];
+};
+#endif
+
 struct Parting {  // how two hulls part best
     int on_a, on_b;  // faces that lie flat on each other, -1 for none: parallel to the face that parts them best
     Number axis[3];  // normal of a face or of two edges along which the gap is largest, out of a
@@ -120,6 +129,24 @@ struct Parting {  // how two hulls part best
     Near near_a, near_b;
 #if HOST
     Edge placed_b[NEAR_ROOM];  // the near edges of b in the frame of a, where there is room for them
+    Met met[MET_ROOM];         // sorted by the near edge of b
+    int met_count;             // -1: there are more than there is room for
+    unsigned long long marks;  // of their edges of a by the number modulo 64
+    // Whether a slot of edges has surely no contact.
+    INLINE bool never(int slot) const { return met_count >= 0 && !(marks >> (slot / 2 & 63) & 1); }
+    INLINE void meet(int edge, int other, const Crossing& crossing) {
+        if (met_count == MET_ROOM) met_count = -1;
+        if (met_count < 0) return;
+        Met& one = met[met_count++];
+        one.edge = edge;
+        one.other = other;
+        one.leaves = crossing.leaves;
+        one.gap = plain(crossing.gap);
+        one.normal[0] = plain(crossing.normal.x);
+        one.normal[1] = plain(crossing.normal.y);
+        one.normal[2] = plain(crossing.normal.z);
+        marks |= 1ULL << (edge & 63);
+    }
 #endif
 };
 
@@ -147,11 +174,48 @@ INLINE bool edge_beside(const Constants& body, Vec start, Vec along, Number marg
     return false;
 }
 
+#if HOST
+const int MARKED_ROOM = 64;
+// Marks for each sphere of a hull the sides of a body's box beyond which it is, by more than a margin; `turn` and `shift`
+// bring it into the frame of that body.
+INLINE void mark_sides(const Constants& body, const Hull& hull, const Mat& turn, Vec shift, Number margin, int* sides) {
+    for (int i = 0; i < hull.spheres.count; i++) {
+        const Vec center = shift + turn * hull.spheres.center(i);
+        const Number at[3] = {plain(center.x), plain(center.y), plain(center.z)};
+        const Number far = margin + plain(hull.spheres.radius(i));
+        sides[i] = 0;
+        for (int k = 0; k < 3; k++) {
+            sides[i] |= (int)(at[k] > body.high[k] + far) << 2 * k | (int)(at[k] < body.low[k] - far) << (2 * k + 1);
+        }
+    }
+}
+
+// Lists the edges of a hull of which no side of a body's box has both ends beyond it.
+INLINE void list_near(const Hull& hull, const int* sides, Near& near) {
+    for (int i = 0; i < hull.ridges && near.count >= 0; i++) {
+        const Number* row = hull.spheres.geometry.value + hull.ridge(i);
+        if (!(sides[(int)row[0]] & sides[(int)row[1]])) near.add(i);
+    }
+}
+#endif
+
 // Lists the edges of both hulls that are within a margin of the other body's box.
 INLINE void find_near(const Environment& env, int a, int b, const Hull& hull_a, const Hull& hull_b, Number margin,
                       Parting& found) {
     found.near_a.clear();
     found.near_b.clear();
+#if HOST
+    int sides[MARKED_ROOM];
+    const Mat& t = found.turn;
+    const Mat back = {vec(t.x.x, t.y.x, t.z.x), vec(t.x.y, t.y.y, t.z.y), vec(t.x.z, t.y.z, t.z.z)};
+    if (hull_a.spheres.count <= MARKED_ROOM && hull_b.spheres.count <= MARKED_ROOM) {
+        mark_sides(env.constants[b], hull_a, back, -(back * found.shift), margin, sides);
+        list_near(hull_a, sides, found.near_a);
+        mark_sides(env.constants[a], hull_b, t, found.shift, margin, sides);
+        list_near(hull_b, sides, found.near_b);
+        return;
+    }
+#endif
     for (int i = 0; i < hull_a.ridges && found.near_a.count >= 0; i++) {
         Edge edge = edge_of(hull_a, i);
         Vec start = transposed(found.turn, edge.start - found.shift), along = transposed(found.turn, edge.along);
@@ -191,6 +255,9 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
                      Parting& found) {
     int a = pair_a(p), b = pair_b(p);
     found.on_a = found.on_b = -1;
+#if HOST
+    found.met_count = -1;
+#endif
     if (face_count(a) == 0 || face_count(b) == 0) return false;
     if (face_count(a) * support_count(b) + face_count(b) * support_count(a) > MOST_PLANES) return false;
     found.gap = Number(-1e30);
@@ -211,14 +278,27 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
     find_near(env, a, b, hull_a, hull_b, limit + Number(SMOOTHING_M), found);
 #if HOST
     for (int n = 0; n < found.near_b.count; n++) found.placed_b[n] = edge_in(found, hull_b, found.near_b.edge(n));
+    found.met_count = 0;
+    found.marks = 0;
+#endif
+#if HOST
+    Edge placed_a[NEAR_ROOM];
+    for (int m = 0; m < found.near_a.count; m++) placed_a[m] = edge_of(hull_a, found.near_a.edge(m));
 #endif
     Number most = found.gap;
     for (int n = 0; n < found.near_b.many(hull_b.ridges); n++) {
         Edge second = near_edge(found, hull_b, n);
         for (int m = 0; m < found.near_a.many(hull_a.ridges); m++) {
             Crossing crossing;
+#if HOST
+            const Edge first = found.near_a.count >= 0 ? placed_a[m] : edge_of(hull_a, m);
+            if (surely_lean(first, second, Number(OUT_OF_FACE)) || !cross_edges(first, second, crossing)) continue;
+            if (crossing.lean > Number(OUT_OF_FACE)) continue;
+            if (crossing.within && plain(crossing.gap) < limit) found.meet(found.near_a.edge(m), n, crossing);
+#else
             const Edge first = edge_of(hull_a, found.near_a.edge(m));
-            if (surely_lean(first, second, Number(0)) || !cross_edges(first, second, crossing)) continue;
+            if (!cross_edges(first, second, crossing)) continue;
+#endif
             if (crossing.lean > Number(0) || !(plain(crossing.gap) > most)) continue;
             most = plain(crossing.gap);
             Vec normal = rotations[a] * crossing.normal;
@@ -239,7 +319,13 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
 __device__ bool face_edges(const Problem& problem, const Environment& env, int p, int slot, const Mat* rotations,
                            Number limit, const Parting& parting, Facing& facing) {
     int a = pair_a(p);
-    if (!parting.near_a.has(slot / 2)) return false;
+#if HOST
+    const bool listed = parting.met_count >= 0;
+    if (parting.never(slot)) return false;
+#else
+    const bool listed = false;
+#endif
+    if (!listed && !parting.near_a.has(slot / 2)) return false;
     const Hull hull_b = hull_of(problem, env, pair_b(p));
     Edge first = edge_of(hull_of(problem, env, a), slot / 2);
     Vec axis = vec(Real(parting.axis[0]), Real(parting.axis[1]), Real(parting.axis[2]));
@@ -249,7 +335,17 @@ __device__ bool face_edges(const Problem& problem, const Environment& env, int p
     if (along * along > Number(1 - PARALLEL * PARALLEL) * length2) return false;
     Number least = limit;
     int other = -1;
-    for (int n = 0; n < parting.near_b.many(hull_b.ridges); n++) {
+#if HOST
+    for (int i = 0; i < parting.met_count; i++) {
+        const Met& one = parting.met[i];
+        if (one.edge != slot / 2 || one.leaves != (slot % 2 == 1) || !(one.gap < least)) continue;
+        const Number* n = one.normal;
+        if (!(n[0] * plain(axis.x) + n[1] * plain(axis.y) + n[2] * plain(axis.z) > Number(PARALLEL))) continue;
+        least = one.gap;
+        other = parting.near_b.edge(one.other);
+    }
+#endif
+    for (int n = 0; n < (listed ? 0 : parting.near_b.many(hull_b.ridges)); n++) {
         Crossing crossing;
         const Edge second = near_edge(parting, hull_b, n);
         if (edge_leaves(first, second) != (slot % 2 == 1) || surely_lean(first, second, Number(OUT_OF_FACE))) continue;

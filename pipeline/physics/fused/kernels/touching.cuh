@@ -36,6 +36,9 @@ __device__ int touch_pair(const Problem& problem, Environment& env, const Own& o
                 const Number* sphere = problem.geometry.value + env.geometry + 4LL * problem.spheres[start + k];
                 if (beside(second ? cb : ca, reach.frames[second], sphere, reach.limit)) continue;
             }
+#if HOST && HULLS
+            else if (parting.never(k - spheres_in_all)) continue;
+#endif
             const Vec before = own.warm ? own.before[(start + k) / LANES] : none();
             int found = make_contact(problem, env, own.warm, before, p, k, rotations, motions, reach.limit, reach.near,
                                      parting, nullptr, list[count], weights[count]);
