@@ -33,7 +33,7 @@ class PipedPlant:
         path = os.pathsep.join(part for part in (str(folder.resolve()), os.environ.get("PYTHONPATH", "")) if part)
         self._process = subprocess.Popen(
             [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "MUJOCO_GL": "disable"},
         )  # fmt: skip
         task = hand.task
         self.mujoco: str = self._asked((task, task._source, hand.joints, hand.home))
