@@ -78,7 +78,7 @@ def fit_motion(
         config = paper_config(model.file, capture, config)
     ready = _with_surfaces(replace(model, file=_physics_start(model, capture, config)), capture)
     if config.supervise == "tracks":
-        require_outside(World.from_model(ready), capture, split)
+        warnings = (*warnings, *require_outside(World.from_model(ready), capture, split))
     started = time.perf_counter()
     found = _fitted_motion(ready, capture, split, config, checkpoint, model.file.contact is not None)
     found = replace(found, warnings=(*found.warnings, *found.record.unconverged(), *warnings))
