@@ -104,7 +104,7 @@ def fit(
 def _summary(model: ModelFile, out: Path, kept: bool = False) -> str:
     from .output import table, warnings
 
-    bodies = ", ".join(f"{body.name} ({body.motion})" for body in model.bodies)
+    bodies = ", ".join(f"{body.name} ({body.motion})" for body in model.bodies) or "the background, no bodies"
     state = "with physics" if model.contact else "shape and appearance only, without physics"
     head = f"{out} is already the result of this command" if kept else f"Fitted {out}"
     useless = [] if model.not_described is None else [model.not_described.sentence]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .execution import Emit
 from .options import Overwrite
 from .verb import verb
+
+if TYPE_CHECKING:
+    from ..schemas.masks import MasksReport
 
 
 @verb
@@ -62,7 +65,14 @@ def mask(
     borders = None if box is None else _borders(box)
     from ..pipeline.mask import mask as work
 
-    return emit(work(source, out, borders, photo, body, overwrite), str)
+    return emit(work(source, out, borders, photo, body, overwrite), lambda report: _summary(report, source))
+
+
+def _summary(report: MasksReport, source: Path) -> str:
+    manifest = source / "capture.toml"
+    if report.body or not manifest.is_file():
+        return str(report)
+    return f'{report}\n{manifest} names no body yet: add a line [[bodies]], and under it name = "object"'
 
 
 def _borders(text: str) -> tuple[float, float, float, float]:

@@ -140,7 +140,8 @@ def _fit_or_keep(
         refuse_output(out, "model", overwrite)
     _refuse_early(stage, phys_config)
     accept_units = accept_units or _accepts_units(parent)
-    opened = Capture.open(capture, splits=(split,) if stage != "sg-gs" else (), accept_units=accept_units)
+    moving = stage == "phys-geo" or (stage == "all" and (phys_config.effects != () or not _photos_alone(capture)))
+    opened = Capture.open(capture, splits=(split,) if moving else (), accept_units=accept_units)
     started = time.perf_counter()
     request = _Request(
         capture=opened,
@@ -153,7 +154,7 @@ def _fit_or_keep(
         accept_units=accept_units,
     )
     made_of = {} if stage == "phys-geo" else photo_inputs(opened, splat_config)  # phys-geo alone makes no spheres
-    if stage != "sg-gs":
+    if moving:
         made_of |= motion_inputs(opened, parent if stage == "phys-geo" else None, split, phys_config)
     provenance = _provenance(request, made_of)
     if finished and (kept := finished_model(out, provenance, overwrite)) is not None:
@@ -161,7 +162,7 @@ def _fit_or_keep(
         return kept, True
     refuse_output(out, "model", overwrite)
     checkpoint = Checkpoint.beside(out, made_of, resume, overwrite)
-    moves = stage == "phys-geo" or (stage == "all" and _has_motion(opened, split))
+    moves = stage == "phys-geo" or (moving and _has_motion(opened, split))
     # pairs that nobody gave, and videos that identify nothing, are reported before hours of work
     if moves:
         require_known_pairs(opened, split)
@@ -404,6 +405,11 @@ def _mass_parameters(body: Body, fitted: BodyModel) -> list[FittedParameter]:
         for axis, value in zip("xyz", fitted.com_m, strict=True)
     ]
     return rows
+
+
+def _photos_alone(root: Path) -> bool:
+    """Return whether a capture has photos and no place for motion, so that there are no episodes to name."""
+    return (root / "images").is_dir() and not any((root / kind).exists() for kind in ("tracks", "videos"))
 
 
 def _has_motion(capture: Capture, split: str) -> bool:

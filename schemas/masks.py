@@ -49,4 +49,10 @@ class MasksReport(FileModel):
             f"{len(self.photos)} masks of {self.body or 'the body'}, label {self.label}: {found}; it fills "
             f"{100 * shares[0]:.1f} to {100 * shares[-1]:.1f} % of the pictures"
         ]
-        return "\n".join([*lines, *(f"look at {name}: {doubt}" for name, doubt in self.doubtful.items())])
+        lines += [f"look at {name}: {doubt}" for name, doubt in self.doubtful.items()]
+        if self.method == "box" and 2 * len(self.doubtful) > len(self.photos):
+            lines.append(
+                "the colours of most photos do not tell the body: draw these masks by hand, or delete the wrong ones, "
+                "whose photos then serve the background alone"
+            )
+        return "\n".join(lines)

@@ -295,6 +295,8 @@ def _check_labels(
         hint = ""
         if set(np.unique(labels)) <= {0, 255} and bodies:
             hint = "for a mask of 0 and 255, divide it by 255 (and multiply by the body's number)."
+        elif not bodies:
+            hint = 'name the body in capture.toml: a line [[bodies]], and under it name = "object".'
         raise InputDataError(
             f"{path}: label {labels.max()}, but the manifest has {bodies} [[bodies]].",
             f"0 (background) to {bodies}: label k is the k-th of [[bodies]].",

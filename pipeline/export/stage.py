@@ -391,7 +391,8 @@ def _simulated(thing: Path) -> Model:
     lacking = [body.name for body in model.file.bodies if body.name not in model.collision]
     if lacking or model.file.contact is None:
         what = f"the body '{lacking[0]}' has no collision spheres" if lacking else "its physics are not fitted"
-        raise InputDataError(f"{thing}: {what}.", todo="fit it: cgwm fit CAPTURE --out MODEL.")
+        todo = "fit it to a capture with motion (tracks or videos): cgwm fit CAPTURE --out MODEL."
+        raise InputDataError(f"{thing}: {what}.", todo=todo)
     return model
 
 

@@ -184,6 +184,11 @@ def _open(capture: Capture, config: SplatConfig, checkpoint: Checkpoint | None) 
         stage.warnings.append(
             "The cameras are unscaled, so the position of the ground relative to the photos is unknown."
         )
+    if capture.manifest.bodies and capture.cameras.scale.kind == "unscaled":
+        stage.warnings.append(
+            "The cameras are unscaled: lengths of bodies are in the units of the reconstruction, not in metres. Give a "
+            "marker or a known distance in capture.toml, [calibration], and calibrate again."
+        )
     views = load_views(capture, known, config.image_size, device)
     held_out = len(views) > config.test_every
     stage.test = views[:: config.test_every] if held_out else []

@@ -10,9 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cgwm.cli.mask import _summary
 from cgwm.datasets.capture.images import read_label, write_image
 from cgwm.pipeline.mask import mask, mask_videos
 from cgwm.pipeline.mask.doubts import doubts
+from cgwm.pipeline.mask.stage import masks_report
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import InputDataError, NotConvergedError, OutputExistsError, UsageError
 
@@ -76,7 +78,14 @@ def test_a_capture_gets_the_label_of_its_body(tmp_path: Path) -> None:
     assert validate(tmp_path / "capture").facts["masks"] == COUNT
     with pytest.raises(OutputExistsError):
         mask(tmp_path / "capture", tmp_path / "capture" / "masks", body="b")
-    assert mask(tmp_path / "capture", tmp_path / "capture" / "masks", body="a", overwrite=True).label == 1
+    report = mask(tmp_path / "capture", tmp_path / "capture" / "masks", body="a", overwrite=True)
+    assert report.label == 1 and "names no body" not in _summary(report, tmp_path / "capture")
+    # without bodies the masks would be a fault: what to add is said
+    (tmp_path / "capture" / "capture.toml").write_text('format = "cgwm-capture/1"\n')
+    report = mask(tmp_path / "capture", tmp_path / "capture" / "masks", overwrite=True)
+    assert 'add a line [[bodies]], and under it name = "object"' in _summary(report, tmp_path / "capture")
+    with pytest.raises(InputDataError, match=r'a line \[\[bodies\]\], and under it name = "object"'):
+        validate(tmp_path / "capture")
 
 
 def test_what_cannot_be_done_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
@@ -165,6 +174,9 @@ def test_doubtful_masks_are_named() -> None:
     assert said[3].startswith("the body has 2.2 times the size")
     assert said[5] == "nothing of the body was found" and "border" in said[6]
     assert doubts([disc]) == [""]
+    report = masks_report("box", "", 1, [f"{k}.jpg" for k in range(3)], [disc, cut_off, cut_off])
+    assert "draw these masks by hand" in str(report)
+    assert "draw these masks by hand" not in str(masks_report("box", "", 1, ["0.jpg", "1.jpg"], [disc, cut_off]))
 
 
 def test_changed_masks_are_faults(tmp_path: Path) -> None:

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.capture import Capture
+from cgwm.pipeline.fit import fit
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.rendering.render import render
 from cgwm.pipeline.sg_gs import bodies, mcmc
 from cgwm.pipeline.sg_gs.depth_refinement import Refinement, refine
-from cgwm.pipeline.sg_gs.stage import fit_scene
+from cgwm.pipeline.sg_gs.stage import _open, fit_scene
 from cgwm.schemas import InputDataError, SplatConfig
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 110.0
@@ -224,3 +225,19 @@ def test_photos_without_cameras_are_refused(tmp_path):
     (capture.root / "cameras.json").unlink()
     with pytest.raises(InputDataError, match="11 photos and no cameras"):
         fit_scene(Capture.open(capture.root, check=False), CONFIG)
+
+
+def test_photos_alone_need_no_split(tmp_path):
+    capture = make_capture(tmp_path / "photos")
+    (capture.root / "cameras.json").unlink()
+    with pytest.raises(InputDataError, match="11 photos and no cameras"):  # and not: no split 'train'
+        fit(capture.root, tmp_path / "model", splat_config=CONFIG)
+
+
+def test_bodies_of_unscaled_photos_have_a_warning(tmp_path):
+    capture = make_capture(tmp_path / "photos")
+    cameras = json.loads((capture.root / "cameras.json").read_text())
+    cameras["scale"] = {"kind": "unscaled"}
+    (capture.root / "cameras.json").write_text(json.dumps(cameras))
+    stage = _open(Capture.open(capture.root, check=False), CONFIG, None)
+    assert any("in the units of the reconstruction, not in metres" in warning for warning in stage.warnings)
