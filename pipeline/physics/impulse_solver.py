@@ -29,6 +29,11 @@ CONTACT_ONSET_M = 2e-4
 """Depth [m] from which a contact takes its full share of a body's mass; below, the share grows smoothly."""
 LEAST_MOBILITY = 1e-18
 """Added to a sum of mobilities [1/kg], so that it may be divided by where nothing touches."""
+IMMOVABLE = 1e-11
+"""Mobility along the normal [1/kg] up to which a contact moves nothing, as between what is driven and a link whose
+joints do not let it yield: it does not act."""
+LEAST_ACROSS = 1e-6
+"""Least mobility across the normal, as a share of that along it: a drawer yields along its rail alone."""
 FAR_M_S = 1e30
 """Target gap speed of an open contact [m/s], below any real one; finite, so that reverse derivatives stay finite."""
 
@@ -179,9 +184,12 @@ class ContactGroup:
         rows = sides[0].jacobian if len(sides) == 1 else torch.cat([side.jacobian for side in sides], -1)
         mobility = rows.square().sum(-1).unflatten(1, (-1, 3))
         normal_rows = rows.unflatten(1, (-1, 3))[:, :, 0]
-        mass = 1 / mobility[..., 0]
+        along, across = mobility[..., 0], mobility[..., 1] + mobility[..., 2]
+        moves = along > IMMOVABLE
+        along = torch.where(moves, along, 1.0)
+        mass = 1 / along
         ahead = gap + h * speed
-        weight = _onset(ahead, gap)
+        weight = _onset(ahead, gap) * moves
         if touch.area is None:
             share = _share(normal_rows, mass, weight)
         else:
@@ -190,10 +198,10 @@ class ContactGroup:
 
         k, d = coefficients(touch.contact_time_s, touch.damping_ratio, h)
         response = Response(gap, h, k, d)
-        touching = (gap < 0) | (ahead < 0)
+        touching = ((gap < 0) | (ahead < 0)) & moves
         target = torch.where(touching, response.aim(speed), torch.full_like(gap, -FAR_M_S))
         # the sum of the two tangential mobilities bounds the larger one
-        stop_t = share / (mobility[..., 1] + mobility[..., 2])
+        stop_t = share / torch.maximum(across, LEAST_ACROSS * along)
         group = ContactGroup(
             axes=axes,
             relative=relative,

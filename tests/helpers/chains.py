@@ -4,11 +4,12 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from cgwm.pipeline.physics import Body, World
+from cgwm.pipeline.physics import Body, State, World
 from cgwm.pipeline.physics.chain import Chain, Joint
+from cgwm.pipeline.physics.kinematic import Drive
 
 from . import worlds
-from .worlds import F64, batch
+from .worlds import F64, ball_body, batch
 
 
 def link(
@@ -52,3 +53,29 @@ def still(count: int, size: int = 1) -> "worlds.State":
     """Return a state with all bodies at the origin, at rest."""
     row = ((0, 0, 0), (1, 0, 0, 0), (0, 0, 0), (0, 0, 0))
     return worlds.state_of(*[row] * count, count=size)
+
+
+def drawer(aside_m_s: float) -> tuple[World, State, dict[str, Any]]:
+    """Return a drawer on a rail along x that rests on the ground, where it cannot yield, and a finger that pushes it.
+
+    The rail has a dry friction of 2 N and a damping of 8 N s/m; the finger moves at 0.2 m/s, and to the side.
+    """
+    spheres = ((0.05, 0.0, 0.0, 0.03), (-0.05, 0.0, 0.0, 0.03))
+    rail = Joint.of("rail", "slide", "box", "case", axis=(1, 0, 0), damping=8.0, friction=2.0)
+    chain = Chain(name="cabinet", root="case", base="fixed", joints=(rail,))
+    finger = replace(ball_body(0.01, 0.1), name="finger", motion="driven")
+    world = chained(
+        chain,
+        link("case", 0.0),
+        link("box", 1.5, spheres=spheres),
+        finger,
+        contact=worlds.law(0.3, 0.008, 1.0),
+        step_s=0.004,
+    )
+    state = still(3)
+    state.position_m[:, :, 2] = 0.0299
+    state.position_m[:, 2, 0] = 0.091
+    speed = torch.tensor([[[-0.2, aside_m_s, 0.0]]], dtype=F64)
+    place = (state.position_m[:, 2], state.quat_wxyz[:, 2])
+    samples = torch.tensor([[0.0, 1.0]], dtype=F64)
+    return world, state, {"finger": Drive.from_velocities(samples, *place, speed, 0 * speed)}

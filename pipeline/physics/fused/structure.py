@@ -12,7 +12,7 @@ from ..edge_contact import FACE_SLACK_M, LEAST_CROSSING, OUT_OF_FACE
 from ..fixed_surface import BOX, HALF_SPACE, MESH
 from ..friction_ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
 from ..hull import MOST_PLANES, OVERHANG_M, PARALLEL, SAME_NORMAL, SAME_PLANE_M
-from ..impulse_solver import CONTACT_ONSET_M, LEAST_MOBILITY
+from ..impulse_solver import CONTACT_ONSET_M, IMMOVABLE, LEAST_ACROSS, LEAST_MOBILITY
 from ..joint_rows import LIMIT_TIME_S
 from ..surface_mesh import FLAT, MESH_CONTACTS, ORDER
 from .tree import COMMAND_WIDTH, FREE_ROOT, JOINT_COLUMNS, LINK_COLUMNS, Tree, listed, listed_copies, lists_bytes
@@ -54,6 +54,8 @@ _NUMBERS: dict[str, float] = {
     "MOST_PLANES": MOST_PLANES,
     "ONSET_M": CONTACT_ONSET_M,
     "LEAST_MOBILITY": LEAST_MOBILITY,
+    "IMMOVABLE": IMMOVABLE,
+    "LEAST_ACROSS": LEAST_ACROSS,
     "NEWTON_STEPS": NEWTON_STEPS,
     "FLATTEST": FLATTEST,
     **{f"ORDER_{axis}": value for axis, value in zip("XYZ", ORDER, strict=True)},

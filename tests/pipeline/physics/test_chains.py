@@ -21,7 +21,7 @@ from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.schemas import InputDataError, UsageError
-from helpers.chains import chained, double_pendulum, link, still
+from helpers.chains import chained, double_pendulum, drawer, link, still
 from helpers.worlds import F64, ball_body, batch, times
 
 POSES = ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s")
@@ -583,3 +583,16 @@ def test_frames_and_axes_of_joints_need_not_have_unit_length() -> None:
     joint = Joint.of("j", "hinge", "link", "base", quat_wxyz=(3.0, 0, 4.0, 0), axis=(0, 0, 2.0))
     torch.testing.assert_close(joint.quat_wxyz, torch.tensor([[0.6, 0, 0.8, 0]]).to(joint.quat_wxyz))
     torch.testing.assert_close(joint.axis, torch.tensor([[0, 0, 1.0]]).to(joint.axis))
+
+
+def test_a_drawer_is_pushed_by_its_losses_and_what_it_cannot_yield_to_does_not_act() -> None:
+    world, state, commands = drawer(0.0)
+    found = simulate(world, state, torch.tensor([0.0, 0.088, 0.1], dtype=F64), commands, record_contacts=True)
+    box, pushed = world.body_names.index("box"), world.body_names.index("finger")
+    np.testing.assert_allclose(found.velocity_m_s[0, -1, box], [-0.2, 0.0, 0.0], atol=1e-3)
+    assert found.contacts is not None
+    acting = found.contacts.impulse_n_s[0, -1].norm(dim=-1) > 0
+    bodies = {*found.contacts.body_a[acting].tolist(), *found.contacts.body_b[acting].tolist()}
+    assert bodies == {box, pushed}  # the ground bears what the rail does
+    force = found.contacts.impulse_n_s[0, -1][acting].sum(0) / 0.012
+    np.testing.assert_allclose(force.abs().amax(), 2.0 + 8.0 * 0.2, rtol=0.02)  # along the normal: dry and viscous

@@ -119,12 +119,19 @@ INLINE Flag prepare(Contact& c, const Law& law, Real gap, Real speed, Real inver
     c.friction = law.friction;
 #endif
     Flag touches = (plain(gap) < Number(0)) | (plain(ahead) < Number(0));
+#if LINKS
+    touches = touches & (plain(inverse_mass) > Number(IMMOVABLE));
+#endif
     if (!some(touches)) return touches;
     Real depth = choose(plain(ahead) < plain(gap), -ahead, -gap);
     weight = choose(touches, at_most(at_least(Number(1.0 / ONSET_M) * depth, Number(0)), Number(1)), weight);
     c.target = aim(law, gap, speed);
     c.stop_n = reciprocal(inverse_mass);
     c.stop_t = mobility - inverse_mass;
+#if LINKS
+    Real least = Number(LEAST_ACROSS) * inverse_mass;
+    c.stop_t = choose(plain(c.stop_t) > plain(least), c.stop_t, least);
+#endif
     c.impulse = none();
 #if PAIRED
     c.gap = gap;

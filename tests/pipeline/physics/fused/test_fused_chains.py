@@ -22,7 +22,7 @@ from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.runtime import kernel_build
 from helpers import fused_host
-from helpers.chains import chained, double_pendulum, link, still
+from helpers.chains import chained, double_pendulum, drawer, link, still
 from helpers.worlds import F64, ball_body, batch, times
 
 CUDA = torch.cuda.is_available() and kernel_build.available()
@@ -108,6 +108,18 @@ def test_poses_and_contacts_are_those_of_the_torch_engine(fused: Fused, base: st
     pairs = {(names[a], names[max(b, 0)]) for a, b in zip(
         expected.contacts.body_a[acted].tolist(), expected.contacts.body_b[acted].tolist(), strict=True)}  # fmt: skip
     assert (("left_tip", "guard") in pairs) == (base == "driven")
+    for name in POSES:
+        np.testing.assert_allclose(getattr(found, name).cpu(), getattr(expected, name), atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(found.contacts.impulse_n_s.cpu(), expected.contacts.impulse_n_s, atol=1e-9)
+
+
+@pytest.mark.evidence
+def test_a_drawer_on_a_shelf_is_pushed_along_its_rail(fused: Fused) -> None:
+    world, state, commands = drawer(0.1)
+    when = times(0.3, 10.0)
+    expected = simulate(world, state, when, commands, record_contacts=True)
+    found = fused(world, state, when, commands, True)
+    assert expected.contacts is not None and found.contacts is not None
     for name in POSES:
         np.testing.assert_allclose(getattr(found, name).cpu(), getattr(expected, name), atol=1e-9, err_msg=name)
     np.testing.assert_allclose(found.contacts.impulse_n_s.cpu(), expected.contacts.impulse_n_s, atol=1e-9)
