@@ -190,9 +190,11 @@ def _cover(photo: GroundPhoto, bodies: Sequence[Caster], angles: Angles) -> NDAr
             part = np.zeros_like(image)
             chosen = cells[inside & (radii == radius)]
             part[chosen[:, 1], chosen[:, 0]] = 255
-            image |= cv2.dilate(part, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(radius) + 1,) * 2))
+            disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(radius) + 1, 2 * int(radius) + 1))
+            image = np.maximum(image, np.asarray(cv2.dilate(part, disc), np.uint8))
     closed = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((2 * _FINER + 1,) * 2, np.uint8))
-    return cv2.resize(closed.astype(np.float32) / 255, (CELLS, CELLS), interpolation=cv2.INTER_AREA)
+    share = closed.astype(np.float32) / np.float32(255)
+    return np.asarray(cv2.resize(share, (CELLS, CELLS), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _fallen(photo: GroundPhoto, points: Array, angles: Angles) -> Array:
