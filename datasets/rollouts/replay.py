@@ -20,7 +20,7 @@ class Replay:
     """Body frame origins [m], world frame, shape (T, B, 3)."""
     quat_wxyz: Array
     """Orientations T_world_body, shape (T, B, 4)."""
-    contact_m: Array
-    """Place of the contact [m], shape (T, 3)."""
-    impulse_n_s: Array
+    contact_m: Array | None = None
+    """Place of the contact [m], shape (T, 3); None: contacts were not recorded."""
+    impulse_n_s: Array | None = None
     """Its impulse since the frame before [N s], shape (T, 3); zero for no contact."""

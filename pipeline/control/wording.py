@@ -62,5 +62,5 @@ def advice(task: AnyTask, taken_s: float) -> str:
     rate = 0.9 / taken_s
     return (
         f"{1 / taken_s:.3g} plans a second are reached: control_hz = {rate:.2g} holds, or about samples = {samples} "
-        "(fewer pushes are compared), or an idle machine."
+        "(fewer plans are compared), or an idle machine."
     )

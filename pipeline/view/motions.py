@@ -38,6 +38,8 @@ class Motion:
     """Orientations T_world_body, shape (T, B, 4)."""
     contacts: tuple[Contacts, ...]
     """Contacts of each frame."""
+    contacts_known: bool = True
+    """Whether contacts were recorded."""
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     """Cameras of its pictures, by name."""
     image: Callable[[str, int], NDArray[np.uint8]] | None = None
@@ -93,15 +95,18 @@ def still(model: Model) -> Motion:
 
 def replayed(found: Replay) -> Motion:
     """Return a motion that was recorded elsewhere."""
-    acts = np.linalg.norm(found.impulse_n_s, axis=-1) > 0
-    contacts: list[Contacts] = [
-        {"pos_world": place[None], "impulse_world": impulse[None], "mode": np.zeros(1, np.uint8)}
-        if act
-        else _no_contacts()
-        for act, place, impulse in zip(acts, found.contact_m, found.impulse_n_s, strict=True)
-    ]
+    contacts: list[Contacts] = [_no_contacts() for _ in found.times_s]
+    place, impulse = found.contact_m, found.impulse_n_s
+    if place is not None and impulse is not None:
+        for frame in np.flatnonzero(np.linalg.norm(impulse, axis=-1) > 0):
+            one = {"pos_world": place[[frame]], "impulse_world": impulse[[frame]], "mode": np.zeros(1, np.uint8)}
+            contacts[frame] = one
     return Motion(
-        times_s=found.times_s, position_m=found.position_m, quat_wxyz=found.quat_wxyz, contacts=tuple(contacts)
+        times_s=found.times_s,
+        position_m=found.position_m,
+        quat_wxyz=found.quat_wxyz,
+        contacts=tuple(contacts),
+        contacts_known=impulse is not None,
     )
 
 

@@ -196,6 +196,7 @@ class Viewer:
             last = max(1, len(motion.times_s) - 1)
             alone = len(motion.times_s) == 1
             self._frame.max, self._frame.disabled, self._play.disabled = last, alone, alone
+            self._contacts.visible = self._arrow_note.visible = motion.contacts_known
             self._arrow_note.content = _legend(motion.largest_impulse_n_s)
             if self._frame.value != 0:
                 self._frame.value = 0
@@ -215,7 +216,7 @@ class Viewer:
             if self._motion.image is not None and self._frusta.value:
                 for name, handle in self._cameras.items():
                     handle.image = self._motion.image(name, frame)
-            self._status.content = _words(now, frame, len(self._motion.times_s), self._kinds)
+            self._status.content = _words(now, frame, self._motion, self._kinds)
 
     # Controls
 
@@ -325,7 +326,7 @@ def _free_port(host: str, port: int) -> int:
         return int(trial.getsockname()[1])
 
 
-def _words(now: SceneAt, frame: int, count: int, kinds: Mapping[str, str]) -> str:
+def _words(now: SceneAt, frame: int, motion: Motion, kinds: Mapping[str, str]) -> str:
     sliding = int(now.marks.sliding.sum())
     parts = [f"{len(now.marks) - sliding} sticking"] * (len(now.marks) > sliding) + [f"{sliding} sliding"] * (
         sliding > 0
@@ -333,7 +334,9 @@ def _words(now: SceneAt, frame: int, count: int, kinds: Mapping[str, str]) -> st
     contacts = f"contacts: {', '.join(parts)}; largest impulse {now.largest_impulse_n_s:.2g} N s" if parts else ""
     values = [_joint_words(name, value, kinds.get(name, "hinge")) for name, value in now.joints.items()]
     joints = f"\n\njoints: {', '.join(values)}" if values else ""
-    return f"**{now.time_s:.3f} s**, frame {frame + 1} of {count}\n\n{contacts or 'no contact'}{joints}"
+    without = "no contact" if motion.contacts_known else "contacts were not recorded"
+    count = len(motion.times_s)
+    return f"**{now.time_s:.3f} s**, frame {frame + 1} of {count}\n\n{contacts or without}{joints}"
 
 
 def _joint_words(name: str, value: float, kind: str) -> str:

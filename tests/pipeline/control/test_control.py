@@ -146,7 +146,7 @@ def test_numbers_out_of_range_are_refused(inputs: tuple[Path, Path], tmp_path: P
 def test_advice_and_intervals() -> None:
     task = push_task(planner={"control_hz": 20.0, "samples": 16})
     assert advice(task, 0.1) == (
-        "10 plans a second are reached: control_hz = 9 holds, or about samples = 8 (fewer pushes are compared), or an "
+        "10 plans a second are reached: control_hz = 9 holds, or about samples = 8 (fewer plans are compared), or an "
         "idle machine."
     )
     assert advice(task, 0.02).startswith("single plans were late")

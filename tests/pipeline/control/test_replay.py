@@ -43,11 +43,13 @@ def test_a_replay_is_what_was_recorded_and_what_was_predicted(folder: Path) -> N
     np.testing.assert_array_equal(ahead.position_m[:10], real.position_m[:10])  # no plan is as old
     shift = np.linalg.norm(ahead.position_m[10:, 1] - real.position_m[10:, 1], axis=-1)
     assert 0 < shift.max() < 0.3
+    assert real.contact_m is not None and real.impulse_n_s is not None
     pressed = np.linalg.norm(real.impulse_n_s, axis=-1) > 0
     away = np.linalg.norm((real.contact_m - real.position_m[:, 1])[pressed], axis=-1)
     np.testing.assert_allclose(away, RADIUS, rtol=1e-9)
     shown = replayed(real)
     assert [len(rows["mode"]) for rows in shown.contacts] == pressed.astype(int).tolist()
+    assert shown.contacts_known and not replayed(ahead).contacts_known
 
 
 def test_a_run_alone_is_refused(folder: Path) -> None:
@@ -72,6 +74,7 @@ def test_a_run_of_a_hand_shows_its_links_and_wants_the_same_hand(folder: Path, t
     np.testing.assert_allclose(real.quat_wxyz[:, 1], turned, atol=1e-12)
     np.testing.assert_array_equal(ahead.position_m[:, :3], real.position_m[:, :3])  # plans show the object alone
     assert (ahead.quat_wxyz[:8, 3] == real.quat_wxyz[:8, 3]).all() and (ahead.position_m != real.position_m).any()
+    assert not replayed(real).contacts_known  # forces of a hand are sums over all its contacts
     hand.write_text(hand.read_text() + "<!-- another -->")
     with pytest.raises(InputDataError, match="the hand is not that of these runs"):
         replays_of(folder / "model", tmp_path / "run")
