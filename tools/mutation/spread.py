@@ -26,7 +26,11 @@ PRELOADED = (
 
 
 def preload() -> None:
-    """Load what nearly all tests load; what cannot be loaded is for the tests to say."""
+    """Load what nearly all tests load; what cannot be loaded is for the tests to say.
+
+    The libraries read the number of threads when they are loaded: one, as the processes share the cores.
+    """
+    os.environ["OMP_NUM_THREADS"] = "1"
     for name in PRELOADED:
         with contextlib.suppress(Exception):
             __import__(name)
