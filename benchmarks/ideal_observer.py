@@ -11,6 +11,11 @@ class leaves of it. Smoothing is left out, as it can be undone, and so are a mag
 wind, which does nothing without its drag. An effect is nameable with five standard errors (`NAMEABLE`), half of whose
 square no other class explains; with `--answers` the recall of a run of `missing_effects.py` is printed for what is
 nameable, too: no rule that seldom names anything wrong can have much more.
+
+`best` is sharper, and asks for no count of standard errors: an observer who knows, beside the errors, that one effect
+of the library or none is hidden, how sizes are drawn (log-uniform over three decades) and that half of all captures
+hide nothing, names the class whose probability, given the flights, is above 95 %. `best` is the share of draws of the
+errors in which that is the class of the true effect. Nothing that is in no library confuses this observer.
 """
 
 from __future__ import annotations
@@ -44,6 +49,7 @@ from diagnose import base_settings
 from real_like import STAGES
 from real_like.errors import Errors, slow_correlation
 from real_like.score import EQUIVALENT, RIGHT, judge, rate, ratio_of
+from scipy.special import log_ndtr
 from store import ROOT
 
 LEAST_FRAMES = 6
@@ -54,6 +60,11 @@ NAMEABLE = (25.0, 12.5)
 itself scatters by one standard error about its size."""
 BINS = ((0.0, 17.0), (17.0, np.inf))
 """Ratios of the effect to the slow error: small and large ones."""
+
+SIZES = np.geomspace(1e-3, 1.0, 13)
+"""Sizes of an effect, in widths of its parameters, that are likely alike for the best observer."""
+SURE, DRAWS = 0.95, 400
+"""Probability above which a class is named, and draws of the errors."""
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -151,9 +162,7 @@ def _whitened(flights: Segments, slopes: Array, k: int, errors: Errors, bursts_s
 
 def limit(found: Seen, effect: dict[str, Any]) -> tuple[float, float] | None:
     """Return the square of a true effect in standard errors, and what the best of another class leaves of it."""
-    name, true = effect["name"], np.zeros(len(found.names))
-    for k, (own, number) in enumerate(zip(found.names, found.numbers, strict=True)):
-        true[k] = effect["values"].get(number, 0.0) if own == name else 0.0
+    name, true = effect["name"], _true(found, effect)
     score = found.information @ true
     square = float(true @ score)
     alike = set[str]().union({name}, *(group for group in EQUIVALENT if name in group))
@@ -170,6 +179,55 @@ def _explained(found: Seen, score: Array, name: str) -> float:
     return float(np.square(vectors[:, kept].T @ (score[own] * width) / np.sqrt(values[kept])).sum())
 
 
+def best_recall(found: Seen, effect: dict[str, Any], nonnegative: frozenset[str] = frozenset()) -> float:
+    """Return how often an observer who knows how effects are drawn is sure of the class of a true one, and is right.
+
+    Args:
+        found: What the flights show.
+        effect: The true effect.
+        nonnegative: Effects of one number that is not negative.
+    """
+    name, true = effect["name"], _true(found, effect)
+    values, vectors = np.linalg.eigh(found.information)
+    root = vectors * np.sqrt(values.clip(0.0))
+    errors = np.random.default_rng(0).standard_normal((DRAWS, len(true)))
+    score = found.information @ true + errors @ root.T
+    names = list(dict.fromkeys(found.names))
+    evidence = np.stack([_log_evidence(found, score, one, one in nonnegative) for one in names])
+    # before the data nothing is hidden in half of the captures, and no effect is likelier than another
+    logs = np.concatenate((np.zeros((1, DRAWS)), evidence - np.log(len(names))))
+    share = np.exp(logs - np.logaddexp.reduce(logs, 0))[1:]
+    classes = [{one} for one in names] + [set(group) & set(names) for group in EQUIVALENT]
+    sure = np.stack([share[[one in group for one in names]].sum(0) for group in classes if group])
+    kept = [group for group in classes if group]
+    first = sure.argmax(0)  # a single effect before its class, where they are alike
+    right = np.array([name in group for group in kept])[first]
+    return float(np.mean(right & (sure.max(0) > SURE)))
+
+
+def _log_evidence(found: Seen, score: Array, name: str, nonnegative: bool) -> Array:
+    """Return the logarithm of the likelihood of an effect of unknown size against none, for scores (D, P), as (D)."""
+    own = [k for k, other in enumerate(found.names) if other == name]
+    width = found.width[own]
+    values, vectors = np.linalg.eigh(found.information[np.ix_(own, own)] * np.outer(width, width))
+    values = values.clip(0.0)
+    along, logs = (score[:, own] * width) @ vectors, []
+    for size in SIZES:
+        precision = values + size**-2.0
+        log = 0.5 * (along**2 / precision).sum(1) - 0.5 * np.log(size**2 * precision).sum()
+        if nonnegative and len(own) == 1:
+            sign = float(vectors[0, 0])
+            log = log + log_ndtr(sign * along[:, 0] / np.sqrt(precision[0])) + np.log(2)
+        logs.append(log)
+    return np.logaddexp.reduce(logs, 0) - np.log(len(SIZES))
+
+
+def _true(found: Seen, effect: dict[str, Any]) -> Array:
+    """Return the values (P) of a true effect, 0 for all others."""
+    pairs = zip(found.names, found.numbers, strict=True)
+    return np.array([effect["values"].get(number, 0.0) if own == effect["name"] else 0.0 for own, number in pairs])
+
+
 def observed(truth: dict[str, Any], capture: Path, model: Path) -> dict[str, Any]:
     """Return what the ideal observer sees of the effects of a capture; None of those that are left out."""
     if not model.is_dir():
@@ -177,7 +235,13 @@ def observed(truth: dict[str, Any], capture: Path, model: Path) -> dict[str, Any
     found = seen(model, capture, truth)
     limits = {effect["name"]: limit(found, effect) for effect in truth["effects"] if effect["name"] in found.names}
     limits |= {name: None for name in limits if name == "ground_magnet"}
-    return {"case": truth["name"], "limits": {e["name"]: limits.get(e["name"]) for e in truth["effects"]}}
+    row = {"case": truth["name"], "limits": {e["name"]: limits.get(e["name"]) for e in truth["effects"]}}
+    if len(truth["effects"]) == 1 and limits.get(truth["effects"][0]["name"]) is not None:
+        one_sided = frozenset(
+            c.effect.name for c in library_of(()) if [p.nonnegative for p in c.effect.parameters] == [True]
+        )
+        row["best"] = best_recall(found, truth["effects"][0], one_sided)
+    return row
 
 
 def is_nameable(found: Sequence[float] | None) -> bool | None:
@@ -193,6 +257,10 @@ def table(rows: Sequence[dict[str, Any]], truths: dict[str, Any], answers: dict[
         told = [(row, is_nameable(*row["limits"].values())) for row in inside]
         told = [(row, one) for row, one in told if one is not None]
         lines.append(f"ratio from {low:g} to {high:g}: nameable {rate([one for _, one in told])}")
+        best = [row["best"] for row, _ in told if "best" in row]
+        if best:
+            error = 1.96 * float(np.std(best)) / np.sqrt(len(best))
+            lines.append(f"ratio from {low:g} to {high:g}: the best observer names {np.mean(best):.0%} +- {error:.0%}")
         lines += _named(f"ratio from {low:g} to {high:g}", [row for row, one in told if one], truths, answers)
     pairs = [row for row in rows if len(row["limits"]) == 2]
     told = [(row, [is_nameable(one) for one in row["limits"].values()]) for row in pairs]
