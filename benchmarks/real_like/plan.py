@@ -15,7 +15,17 @@ from . import invented
 from .engines import ENGINE_OF, GROUPS, can_hide
 
 Stage = Literal[
-    "development", "report1", "report2", "report3", "report4", "report5", "report6", "report7", "report8", "report9"
+    "development",
+    "report1",
+    "report2",
+    "report3",
+    "report4",
+    "report5",
+    "report6",
+    "report7",
+    "report8",
+    "report9",
+    "report10",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on `development` alone. Each report stage is read once, after everything is fixed: the first
