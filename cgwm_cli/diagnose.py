@@ -99,16 +99,16 @@ def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> 
     lines = [result.sentence, table(rows, ["effect", "acts in", "judged in", "p", "evidence", "estimate"])]
     if result.flight_before is not None and result.flight_after is not None:
         before, after = result.flight_before.statistic, result.flight_after.statistic
-        added = f", with {listed(result.selected)} {after:.2f}" if result.selected else ""
+        added = f"; with {listed(result.selected)} {after:.2f}" if result.selected else ""
         lines.append(
-            f"flight of '{split}', mean chi2 of one more force in each piece of at most 0.3 s: {before:.2f}{added} "
-            "(1: noise; cgwm compare states that of measured positions)"
+            f"misfit of the flights of '{split}' (mean chi2 of the force that each piece of at most 0.3 s lacks; noise "
+            f"alone gives 1): {before:.2f}{added}"
         )
     lines += [*_limits(result.contact_limits), *_held_out_errors(result.ranking, split)]
     lines += _remaining(result.remaining)
     if result.residual_law is not None:
-        terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms) or "no term"
-        lines.append(f"law of the residual: {terms}")
+        terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms)
+        lines.append(f"law of the residual: {terms or 'none found'}")
     if result.next_experiment is not None:
         lines += _experiment(result.next_experiment)
     lines += _motions(result.next_motions)
@@ -206,7 +206,10 @@ def _experiment(found: NextExperiment) -> list[str]:
 
 
 def _row(entry: RankedEffect, result: DiagnoseResult) -> list[str]:
-    numbers = ", ".join(f"{p.name} = {p.estimate:.3g} +- {p.std_error:.2g} {p.unit}" for p in entry.parameters[:3])
+    numbers = ", ".join(
+        f"{p.name} = {p.estimate:.3g} +- {p.std_error:.2g}{'' if p.unit == '1' else f' {p.unit}'}"
+        for p in entry.parameters[:3]
+    )
     if len(entry.parameters) > 3:
         numbers += ", ..."
     if entry.spread:

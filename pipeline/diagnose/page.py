@@ -119,7 +119,7 @@ def _ranking(result: DiagnoseResult) -> str:
         pieces += _in_contact(contact, result)
     pieces.append(_all_candidates(result))
     pieces += [
-        paragraph(f"{listed(group)} cannot be told apart in these data: any of them explains them as well.")
+        paragraph(f"{listed(group)} cannot be told apart in these data: each of them explains these data as well.")
         for group in result.aliases
     ]
     return section("Which effect explains the data", *pieces)

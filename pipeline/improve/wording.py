@@ -14,7 +14,7 @@ from .ladder import LEAST_FALL, Ladder
 
 WHY = {
     "selected": "named by the diagnosis",
-    "one_left_out": "the same without one of them",
+    "one_left_out": "those above, without one of them",
     "one_of_the_selected": "one of those that the diagnosis names",
     "first_of_the_ranking": "not named, but first of the ranking",
     "law": "law of the residual, found by regression",
