@@ -124,7 +124,7 @@ def select_next(
     if flight.noise_model != WHITE:
         equals = _with_unproven(equals, done, linear.episode)
     equals = _simplest_within(equals, done, linear, kept, variants)
-    named = not any(is_slight(e) for e in equals) and (
+    named = not are_slight(equals) and (
         flight.noise_model == WHITE or any(repeats(e, len(evidence)) for e in equals)  # the level is that of all tests
     )
     return SelectionStep(tuple(ranking), tuple(equals), named)
@@ -160,10 +160,14 @@ def repeats(evidence: Evidence, tested: int) -> bool:
     """Return whether one of many effects is significant beside the scatter between episodes, and not by one alone.
 
     No model of correlated errors is exact: a burst, the smeared edge of a contact or the rest of a hand looks like a
-    force, in its own episode.
+    force, in its own episode. But one long throw may tell more of a drag than all others: where these do not contradict
+    it, an effect counts that is far likelier than a misfit of that one episode, which can look like anything.
     """
     found, level = evidence.repetition, LIMITS.repeated_alpha / max(1, tested)
-    return found is not None and found.p_value < level and found.without_best < LIMITS.without_best
+    if found is None or found.p_value >= level:
+        return False
+    clear = found.beyond_one > LIMITS.beyond_one and found.without_best < LIMITS.rather
+    return clear or found.without_best < LIMITS.without_best
 
 
 def _variant(evidence: Evidence, candidates: Sequence[Candidate], variants: Sequence[Variant]) -> Variant:
@@ -171,12 +175,17 @@ def _variant(evidence: Evidence, candidates: Sequence[Candidate], variants: Sequ
     return next(v for v in variants if candidates[v.place] is evidence.candidate and v.constants == evidence.constants)
 
 
-def is_slight(evidence: Evidence) -> bool:
-    """Return whether a refitted effect is too small to be selected on its evidence."""
-    small = all(
-        abs(evidence.estimates[p.name][0]) < LIMITS.slight * p.scale for p in evidence.candidate.effect.parameters
+def are_slight(equals: Sequence[Evidence]) -> bool:
+    """Return whether effects that explain the data equally well are too small to be selected on their evidence.
+
+    That is the evidence of the likeliest of them: what is small in one of them may be a large force of another kind.
+    """
+    small = any(
+        all(abs(one.estimates[p.name][0]) < LIMITS.slight * p.scale for p in one.candidate.effect.parameters)
+        for one in equals
     )
-    return small and evidence.delta_bic is not None and evidence.delta_bic > LIMITS.slight_bic
+    known = [one.delta_bic for one in equals if one.delta_bic is not None]
+    return small and bool(known) and min(known) > LIMITS.slight_bic
 
 
 def _with_other_constants(

@@ -14,6 +14,7 @@ it is distributed as F.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,7 +25,7 @@ from ..optimization.tails import chi2_tail, f_tail
 from ..optimization.uncertainty import few_covariance
 from ..physics.world import World
 from ..segments.candidates import base_values
-from ..segments.linearization import Linearization, layout, linearize, sums, widths
+from ..segments.linearization import Linearization, eliminate, layout, linearize, sums, widths
 from ..segments.segments import Segments
 from .score_test import score_test, solved
 from .session_scales import NAME, linearize_beside_scales
@@ -162,6 +163,8 @@ class Repetition:
     """Probability of a larger statistic without the effect, with that scatter."""
     without_best: float
     """The same without the episode that speaks most for it; 1 where it is the only one."""
+    beyond_one: float = -math.inf
+    """Twice the logarithm of the odds of the effect against a misfit of one episode, of any kind."""
 
 
 def repetition(
@@ -188,8 +191,39 @@ def repetitions(
     tests = []
     for columns in effects:
         found = [_beside_scatter(*one, columns, dispersion) for one in zip(parts, usual, strict=True)]
-        tests.append(Repetition(*found[0], max((p_value for _, p_value in found[1:]), default=1.0)))
+        (scatter, p_value), without = found[0], max((p_value for _, p_value in found[1:]), default=1.0)
+        beyond = _beyond_one(linear, columns, beside, dispersion * scatter) if beside else -math.inf
+        tests.append(Repetition(scatter, p_value, without, beyond))
     return tests
+
+
+def _beyond_one(linear: Linearization, columns: Sequence[int], every: Sequence[int], dispersion: float) -> float:
+    """Return twice the logarithm of the odds of an effect against a misfit of one episode, of any kind.
+
+    Such a misfit is whatever all effects together can do, in one episode alone, each as large as it usually is. That
+    can also look like the effect, but seldom looks like nothing else: the odds are those of marginal likelihoods.
+    """
+    base = list(range(linear.base))
+    information, score = sums(linear, [*base, *columns])
+    count = len(score) - len(widths(linear, columns))
+    effect = _evidence(*eliminate(information, score, count), widths(linear, columns), dispersion)
+    bare, fitted = replace(linear, prior=np.zeros_like(linear.prior)), np.zeros(0)
+    if base:
+        fitted = solved(*sums(linear, base), widths(linear, base))[0]
+    width, misfits = widths(linear, every), []
+    for episode in np.unique(linear.episode):
+        matrix, slope = sums(bare.only_episode(int(episode)), [*base, *every])
+        slope = slope[count:] - matrix[count:, :count] @ fitted
+        misfits.append(_evidence(matrix[count:, count:], slope, width, dispersion))
+    return effect - max(misfits)
+
+
+def _evidence(information: Array, score: Array, width: Array, dispersion: float) -> float:
+    """Return twice the logarithm of the likelihood of values with a prior of some widths against that of none."""
+    values, vectors = np.linalg.eigh(information * np.outer(width, width) / dispersion)
+    values = values.clip(0.0)
+    along = vectors.T @ (score * width) / dispersion
+    return float((along**2 / (values + 1)).sum() - np.log1p(values).sum())
 
 
 def _usual(linear: Linearization, dispersion: float, beside: Sequence[int]) -> tuple[float, float]:

@@ -274,7 +274,7 @@ class _Search:
         scatter, before = beside.scatter, worst_omnibus(beside.windows, beside.scatter)
         found = completed(beside.prepared, chosen, self.candidates, scatter, errors)
         prepared, quick = beside.prepared.with_own(found.world), self.prepared.with_own(found.world)
-        tested = judged(prepared, found, scatter, slow, own_law is not None)
+        tested = judged(prepared, found, self.candidates, scatter, slow, own_law is not None)
         found = tested.selection.with_scatter(prepared.groups, scatter).without_idle()
         changed = found.world is not self.world
         left, share = _left(quick, self.world, found.world, changed)

@@ -160,20 +160,28 @@ def reconsidered(
 
 
 def judged(
-    prepared: Prepared, found: FlightSelection, scatter: float, slow: SlowErrors | None, followed: bool
+    prepared: Prepared,
+    found: FlightSelection,
+    candidates: Sequence[Candidate],
+    scatter: float,
+    slow: SlowErrors | None,
+    followed: bool,
 ) -> JudgedSelection:
     """Leave out the effects whose law is another one, and beside slow errors those that episodes contradict.
 
     Args:
         prepared: The episodes.
         found: The selected effects.
+        candidates: All candidates.
         scatter: Factor by which variances exceed those of the noise.
         slow: The slow errors.
         followed: Whether what is left is known to be a force that differs from episode to episode.
     """
     if found.flight is None:
         return JudgedSelection(selection=found)
-    others = other_forms(found.flight, found.world, found.classes, scatter)
+    others = other_forms(
+        found.flight, found.world, found.classes, scatter, candidates, prepared.has_orientation, prepared.groups
+    )
     fleeting = frozenset(without_lasting(found.flight, found.world, found.names, scatter))
     wrong = {one.effect for one in others if one.likelier} | fleeting
     if wrong and set(found.names) - wrong:
@@ -195,8 +203,9 @@ def _without_levelling(prepared: Prepared, found: FlightSelection, scatter: floa
             continue
         other = left.without({step.best.name})
         if other.flight is not None:
-            level = THRESHOLDS.flight.repeated_alpha / max(1, len(step.evidence))
-            if common_tilt_p(other.flight, other.world, prepared.groups, scatter) > level:
+            # levels look like a tilt alone, so that the number of effects that were tested does not matter
+            p_value = common_tilt_p(other.flight, other.world, prepared.groups, scatter)
+            if p_value > THRESHOLDS.flight.repeated_alpha:
                 left = other
     return left.or_none_of(found)
 

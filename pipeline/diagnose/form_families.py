@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 
 import numpy as np
@@ -59,12 +60,15 @@ def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) ->
 
 
 def _when(motion: FlownMotion) -> Mapping[str, Tensor]:
-    """Return factors of a force that sets in or ends."""
+    """Return factors of a force that sets in or ends, or does both."""
     since, left = motion.spans_s
     usual, found = float(np.quantile((since + left)[:, 0].numpy(), USUAL_FLIGHT)), {}
     for share in SHARES:
         on = (since > share * usual).double()
         found |= {f"from {share * usual:.2g} s of a flight on": on, f"until {share * usual:.2g} s of a flight": 1 - on}
+    for first, last in itertools.combinations(SHARES, 2):
+        on = ((since > first * usual) & (since <= last * usual)).double()
+        found[f"from {first * usual:.2g} to {last * usual:.2g} s of a flight"] = on
     return found
 
 

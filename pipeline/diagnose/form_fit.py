@@ -5,16 +5,19 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..physics.effects.effect import ActiveEffect
-from ..segments.candidates import base_parameters, base_values
+from ..segments.candidates import Variant, base_parameters, base_values
 from ..segments.force_fields import FlownMotion, ForceField
+from ..segments.linearization import derivatives
 from ..segments.segment_fit import Linear, projected
 from ..segments.segments import Segments
+from .session_scales import scale_variant
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -27,6 +30,26 @@ SINGULAR = 1e-7
 """The same of the largest information, below which a direction is none."""
 
 
+class FormCost(NamedTuple):
+    """What a form in place of an effect leaves."""
+
+    chi2: float
+    """Chi2, up to a constant."""
+    scatter: float
+    """Factor by which variances between episodes exceed those of the noise; at least 1."""
+    counts: float
+    """Degrees of freedom of that factor."""
+
+
+class Scales(NamedTuple):
+    """Scales of lengths that differ between sessions."""
+
+    member: Array
+    """What each flight has of each number by which they differ, (B, n)."""
+    spread: float
+    """Their standard deviation."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FormFit:
     """Quadratic cost of episodes (E) in parameters and forms (n), at the fit of an effect, states eliminated."""
@@ -36,48 +59,108 @@ class FormFit:
     score: Array
     """Score of each episode, shape (E, n)."""
     prior: Array
-    """Prior information, of the other parameters alone, shape (n,)."""
+    """Prior information, of the other parameters of the world alone, shape (n,)."""
     without: Array
     """Step (n,) that takes the effect away."""
     rest: list[int]
-    """Places of the other parameters."""
+    """Places of the other parameters, and of the numbers by which sessions differ."""
     forms: list[list[int]]
     """Places of the numbers of each form."""
+    more: list[list[list[int]]]
+    """Places of the numbers of each further effect, at each combination of its constants."""
+    others: list[list[int]]
+    """Places of the numbers of each other effect of the world that has a value for all episodes."""
+    values: Array
+    """Values of the other parameters, shape (n,)."""
+    nonnegative: frozenset[int]
+    """Places of numbers of further effects that are not negative."""
+    count: float
+    """Degrees of freedom of the flights."""
 
     @staticmethod
-    def of(motion: FlownMotion, active: ActiveEffect, forms: Sequence[ForceField]) -> FormFit:
+    def of(
+        motion: FlownMotion,
+        active: ActiveEffect,
+        forms: Sequence[ForceField],
+        more: Sequence[Variant] = (),
+        scales: Scales | None = None,
+    ) -> FormFit:
         """Return the cost of flights in the parameters of their world and in forms of an effect, its own first.
 
         Without a force, a body moves as with it less what the force does along the motion as it was: that is exact,
         where the derivative by its parameter also has what the force does to its own change of the motion.
+
+        Args:
+            motion: The flights.
+            active: The effect.
+            forms: Its forms.
+            more: Further effects, at their neutral values.
+            scales: How the scales of lengths of sessions differ.
         """
         flight = motion.flight
-        parameters = base_parameters(flight.world, "flight")
-        count, values = len(parameters), base_values(flight.world, parameters)
-        rows, jacobian = flight.residuals(parameters, values)
-        columns = motion.innovations(ForceField.joined(forms)).to(jacobian)
-        ends = np.cumsum([count, *(form.size for form in forms)]).tolist()
-        joined = torch.cat((jacobian[..., :count], columns, jacobian[..., count:]), -1)
-        information, score = _by_episode(flight, projected(flight, rows, joined, ends[-1]))
-        own = [k for k, p in enumerate(parameters) if p.name.partition(".")[0] == active.effect.name]
+        own_scale = [] if scales is None else [scale_variant(flight.world)]
+        parameters, rows, jacobian = derivatives(flight, flight.world, [*more, *own_scale])
+        base, size = base_parameters(flight.world, "flight"), len(parameters) - len(own_scale)
+        count, values = len(base), base_values(flight.world, base)
+        columns = [jacobian[..., :size], motion.innovations(ForceField.joined(forms)).to(jacobian)]
+        ends = np.cumsum([size, *(form.size for form in forms)]).tolist()
+        last = ends[-1]
+        if scales is not None:
+            member = torch.tensor(scales.member).to(jacobian)[:, None, None]
+            columns.append(jacobian[..., size : size + 1] * member)
+            last += member.shape[-1]
+        joined = torch.cat((*columns, jacobian[..., len(parameters) :]), -1)
+        information, score = _by_episode(flight, projected(flight, rows, joined, last))
+        own = [k for k, p in enumerate(base) if p.name.partition(".")[0] == active.effect.name]
         rest = [k for k in range(count) if k not in own]
-        taken = range(count, count + len(own)) if active.effect.has("wrench") else own
+        widths = [parameters[k].prior[1] for k in rest]
+        if scales is not None:
+            rest, widths = [*rest, *range(ends[-1], last)], [*widths, *[scales.spread] * (last - ends[-1])]
+        taken = range(size, size + len(own)) if active.effect.has("wrench") else own
+        place = {p.name: k for k, p in enumerate(parameters)}
+        further: dict[int, list[list[int]]] = {}
+        for variant in more:
+            further.setdefault(variant.place, []).append([place[name] for name in variant.parameters])
+        others: dict[str, list[int]] = {}
+        for k in range(count):
+            if k not in own and base[k].shared == "all":
+                others.setdefault(base[k].name.partition(".")[0], []).append(k)
         return FormFit(
             information=information,
             score=score,
-            prior=_placed(rest, [1 / parameters[k].prior[1] ** 2 for k in rest], ends[-1]),
-            without=_placed(taken, [-float(values[k]) for k in own], ends[-1]),
+            prior=_placed(rest, [width**-2.0 for width in widths], last),
+            without=_placed(taken, [-float(values[k]) for k in own], last),
             rest=rest,
             forms=[list(range(a, b)) for a, b in itertools.pairwise(ends)],
+            more=list(further.values()),
+            others=list(others.values()),
+            values=_placed(range(count), values.tolist(), last),
+            nonnegative=frozenset(k for k, p in enumerate(parameters) if k >= count and p.bounds[0] == 0.0),
+            count=max(float(flight.dof.sum()), 2.0),
         )
 
-    def in_its_stead(self, form: Sequence[int], dispersion: float) -> tuple[float, float]:
-        """Return chi2 with a form in place of the effect, up to a constant, and its scatter between episodes."""
-        step = self._solved([*self.rest, *form], self.without)
+    def in_its_stead(
+        self, form: Sequence[int], dispersion: float, further: Sequence[int] = (), gone: Sequence[int] = ()
+    ) -> FormCost:
+        """Return chi2 with a form in place of the effect, and the scatter of its numbers between episodes.
+
+        Args:
+            form: Places of the numbers of the form.
+            dispersion: Factor by which variances exceed those of the noise.
+            further: Those of a further effect, which is none where a number is negative that may not be.
+            gone: Those of another effect of the world that is taken away, too.
+        """
+        without = self.without.copy()
+        without[list(gone)] = -self.values[list(gone)]
+        step = self._solved([*(k for k in self.rest if k not in gone), *form, *further], without)
+        if any(step[k] < 0 for k in further if k in self.nonnegative):
+            return self.in_its_stead(form, dispersion)
         slopes = self.score - self.information @ step
         q, dof = _scatter(self.information[:, form][:, :, form], slopes[:, form])
-        scatter = (LIMITS.model_counts + q / dispersion) / (LIMITS.model_counts + dof)
-        return self._cost(step) / dispersion, max(1.0, scatter)
+        counts = LIMITS.model_counts + dof
+        return FormCost(
+            self._cost(step) / dispersion, max(1.0, (LIMITS.model_counts + q / dispersion) / counts), counts
+        )
 
     def _cost(self, step: Array) -> float:
         """Return the cost of a step (n,) from the fit, up to a constant."""

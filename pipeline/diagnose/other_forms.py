@@ -8,8 +8,16 @@ place in flights linearised at their fit, with the states and the other effects 
 
 Before the data, no form of a family is likelier than another, no family likelier than another, and all together are as
 likely as the law that is named; the odds are those of the mean likelihoods. No model of errors is exact, and how the
-numbers of a form scatter from episode to episode tells how far it can be believed beside that form (`falsification`):
-a difference of chi2 counts in units of that scatter.
+numbers of a force scatter from episode to episode tells how far it can be believed (`falsification`). The law of least
+chi2 says that scatter, since a wrong one scatters by what it misses: with d degrees of freedom, which this scatter s is
+known to, a law whose chi2 is larger by x has the likelihood (1 + x / (d s))^(-d/2), that of Student's distribution.
+
+What else acts need not be named yet: the push of a wind that is too small to be named bends the law of the drag through
+which it acts, and another power of the speed follows that, too. Each law, that of the name and every other one, is
+therefore as likely with one more effect of the library beside it as without, no such effect likelier than another, and
+one of them costs what its numbers do in BIC. Nor need all that is named act: one force of another form may be what two
+effects of the library imitate together, as one that grows with the height is imitated by a scale of lengths and a
+magnet, so that each law is also tried without one of the other named effects, whose numbers it saves.
 """
 
 from __future__ import annotations
@@ -20,12 +28,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..physics.effects.effect import ActiveEffect
+from ..physics.effects.registry import FLIGHT_ALIASES
 from ..physics.world import World
-from ..segments.force_fields import FlownMotion, ForceField
+from ..segments.candidates import Candidate, acts_in, admissible, variants_of
+from ..segments.force_fields import FlownMotion
 from ..segments.segments import Segments
+from .coupled_effects import DRAGS
 from .form_families import Family, families_of, own_field
-from .form_fit import FormFit
+from .form_fit import FormCost, FormFit, Scales
+from .session_scales import apart, linearize_beside_scales, members, scale_spread
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -40,13 +51,13 @@ class OtherForms:
     words: str
     """The form that explains the flights best, in words."""
     gain: float
-    """Fall of chi2 with that form in place of the effect, beside the scatter between episodes."""
+    """Twice the logarithm of the odds of that form against the effect's own law."""
     odds: float
     """Twice the logarithm of the odds of all forms against the effect's own law."""
 
     @property
     def likelier(self) -> bool:
-        """Whether the force has another form than that of the effect, rather than that one."""
+        """Whether the force has another form than that of the effect, or too likely has one, for it to be named."""
         return self.odds > LIMITS.form_odds
 
     @property
@@ -56,7 +67,13 @@ class OtherForms:
 
 
 def other_forms(
-    flight: Segments, world: World, classes: Sequence[tuple[str, ...]], dispersion: float
+    flight: Segments,
+    world: World,
+    classes: Sequence[tuple[str, ...]],
+    dispersion: float,
+    candidates: Sequence[Candidate] = (),
+    turned: bool = True,
+    groups: Sequence[int] | None = None,
 ) -> list[OtherForms]:
     """Compare each named effect that is a force with its other forms.
 
@@ -65,31 +82,90 @@ def other_forms(
         world: The world with the effects at their fitted parameters.
         classes: Names of each effect and of its equals, its own the first.
         dispersion: Factor by which variances exceed those of the noise.
+        candidates: Effects of which one more may act.
+        turned: Whether orientations were measured.
+        groups: Session of each episode; None where all are of one.
     """
     motion, found = FlownMotion(flight.in_world(world)), []
     shared = [one for one in world.effects if all(p.shared == "all" for p in one.effect.parameters)]
     active = {one.effect.name: one for one in shared}
+    kept, _ = admissible(world, candidates, turned, flight.observations.spin_rad_s is not None)
+    scales = _scales(motion.flight, kept, groups) if classes and groups is not None else None
     for named in classes:
         own = own_field(motion, active[named[0]]) if named[0] in active else None
-        if own is not None:
-            found.append(_compared(motion, active[named[0]], own, families_of(motion, own, named), dispersion))
+        if own is None:
+            continue
+        other = [one for one in kept if one.effect.name not in _alike(named)]
+        more = [one for one in variants_of(other, world.gravity[0, :1]) if acts_in(one, "flight")]
+        families = families_of(motion, own, named)
+        forms = {words: field for family in families for words, field in family.items()}
+        fit = FormFit.of(motion, active[named[0]], [own, *forms.values()], more, scales)
+        found.append(_compared(fit, named[0], families, dispersion))
     return found
 
 
-def _compared(
-    motion: FlownMotion, active: ActiveEffect, own: ForceField, families: Sequence[Family], dispersion: float
-) -> OtherForms:
-    """Compare an effect, whose force is given, with families of other forms."""
-    forms = {words: field for family in families for words, field in family.items()}
-    fit = FormFit.of(motion, active, [own, *forms.values()])
-    as_it_is = fit.in_its_stead(fit.forms[0], dispersion)[0]
-    gains = {}
-    for words, columns in zip(forms, fit.forms[1:], strict=True):
-        chi2, scatter = fit.in_its_stead(columns, dispersion)
-        gains[words] = (as_it_is - chi2) / scatter
-    best = max(gains, key=lambda one: gains[one])
-    halves = [_log_mean([0.5 * gains[words] for words in family]) for family in families]
-    return OtherForms(effect=active.effect.name, words=best, gain=gains[best], odds=2 * _log_mean(halves))
+def _scales(flight: Segments, candidates: Sequence[Candidate], groups: Sequence[int]) -> Scales | None:
+    """Return how the scales of sessions differ, as flights show it beside all candidates; None where they do not."""
+    member = members(flight, groups)
+    if member is None:
+        return None
+    every = [one for one in variants_of(candidates, flight.world.gravity[0, :1]) if acts_in(one, "flight")]
+    spread = scale_spread(linearize_beside_scales(flight, flight.world, every, groups))
+    return None if spread is None else Scales(apart(member), spread)
+
+
+def _alike(named: Sequence[str]) -> set[str]:
+    """Return the names of an effect, its equals and what flights tell no better from it."""
+    found = set(named).union(*(group for group in FLIGHT_ALIASES if named[0] in group))
+    return found | set(DRAGS) if named[0] in DRAGS else found
+
+
+def _compared(fit: FormFit, name: str, families: Sequence[Family], dispersion: float) -> OtherForms:
+    """Compare an effect, whose own law is the first form, with families of others, each with one more effect or not."""
+    forms = [words for family in families for words in family]
+    tried = [_tried(fit, columns, dispersion) for columns in fit.forms]
+    likeliest = min(
+        (cost for groups in tried for group in groups for law in group for cost, _ in law), key=lambda c: c.chi2
+    )
+    logs = [
+        _log_mean(
+            [
+                _log_mean([_log_mean([_log(*one, likeliest, fit.count) for one in law]) for law in group])
+                for group in groups
+            ]
+        )
+        for groups in tried
+    ]
+    half = {words: log - logs[0] for words, log in zip(forms, logs[1:], strict=True)}
+    best = max(half, key=lambda one: half[one])
+    together = [_log_mean([half[words] for words in family]) for family in families]
+    return OtherForms(effect=name, words=best, gain=2 * half[best], odds=2 * _log_mean(together))
+
+
+Tried = list[list[list[tuple[FormCost, int]]]]
+"""Costs of a form and how many numbers it has more: as it is, by one more effect, by one fewer; by constants."""
+
+
+def _tried(fit: FormFit, form: Sequence[int], dispersion: float) -> Tried:
+    """Return the costs of a form as it is, with one more effect of the library, and without one that is named."""
+    found: Tried = [[[(fit.in_its_stead(form, dispersion), 0)]]]
+    if fit.more:
+        found.append(
+            [[(fit.in_its_stead(form, dispersion, one), len(one)) for one in variants] for variants in fit.more]
+        )
+    if fit.others:
+        found.append([[(fit.in_its_stead(form, dispersion, (), one), -len(one))] for one in fit.others])
+    return found
+
+
+def _log(cost: FormCost, more: int, likeliest: FormCost, count: float) -> float:
+    """Return the logarithm of a likelihood against that of the least chi2, of a form with so many numbers more.
+
+    How far variances exceed those of the noise is what the form of least chi2 says; that it is not known makes the
+    likelihood one of Student's.
+    """
+    excess = (cost.chi2 - likeliest.chi2) / (likeliest.counts * likeliest.scatter)
+    return -0.5 * (likeliest.counts * math.log1p(excess) + more * math.log(count))
 
 
 def _log_mean(values: Sequence[float]) -> float:

@@ -2,13 +2,14 @@
 
 A system that is calibrated anew measures lengths by some tenths of a per cent differently, which looks like a change of
 gravity that comes and goes with the session. How sessions differ is fitted beside the candidates, or it would count as
-scatter of every effect between episodes; it may be as large as flights show that it is. What sessions have in common is
-left to the candidates.
+scatter of every effect between episodes; it may be as large as flights show that it is, beside what is usual: the two
+sessions of a recording tell hardly how far sessions scatter. What sessions have in common is left to the candidates.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -21,12 +22,12 @@ from ..physics.world import World
 from ..segments.candidates import Variant
 from ..segments.linearization import Linearization, linearize, sums
 from ..segments.segments import Segments
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.verdict
 
 NAME = "session_scale"
 """Name of the scales among the parameters."""
-
-LEAST_SPREAD = 1e-4
-"""Smallest standard deviation between sessions, in that of the prior of a scale: no information is infinite."""
 
 Array = NDArray[np.float64]
 
@@ -42,17 +43,42 @@ def linearize_beside_scales(
         variants: The candidates.
         groups: Session of each episode.
     """
-    sessions = np.unique(np.asarray(groups)[[item.episode for item in flight.items]])
-    counted = [len({item.episode for item in flight.items if groups[item.episode] == one}) for one in sessions]
-    if len(sessions) < 2 or min(counted) < 2:  # of one episode, a scale is one more number for its path
+    member = members(flight, groups)
+    if member is None:
         return linearize(flight, world, variants, groups, robust=False)
+    linear = linearize(flight, world, [*variants, scale_variant(world)], groups, robust=False)
+    spread = _spread(_with_scales(linear, member, linear.parameters[-1].prior[1]), member.shape[1])
+    return _with_scales(linear, apart(member), spread)
+
+
+def members(flight: Segments, groups: Sequence[int]) -> Array | None:
+    """Return which of n sessions each flight belongs to, (B, n); None where their scales cannot be told apart.
+
+    Of one episode, a scale is one more number for its path.
+    """
+    own = np.asarray(groups)[[item.episode for item in flight.items]]
+    sessions = np.unique(own)
+    counted = [len({item.episode for item in flight.items if groups[item.episode] == one}) for one in sessions]
+    if len(sessions) < 2 or min(counted) < 2:
+        return None
+    return (own[:, None] == sessions[None]).astype(np.float64)
+
+
+def apart(member: Array) -> Array:
+    """Return what a flight has of each number by which sessions differ, (B, n - 1), from its session (B, n)."""
+    return member[:, 1:] - 1 / member.shape[1]
+
+
+def scale_variant(world: World) -> Variant:
+    """Return the scale of lengths as a candidate under the name of the sessions' scales."""
     effect = copy.copy(load_effect("length_scale"))
     effect.name = NAME  # pyright: ignore[reportAttributeAccessIssue]
-    scale = Variant(-1, ActiveEffect.of(effect, {}, world.gravity[0, :1]), {})
-    linear = linearize(flight, world, [*variants, scale], groups, robust=False)
-    member = (linear.group[:, None] == sessions[None]).astype(np.float64)
-    spread = _spread(_with_scales(linear, member, linear.parameters[-1].prior[1]), len(sessions))
-    return _with_scales(linear, member[:, 1:] - 1 / len(sessions), spread)
+    return Variant(-1, ActiveEffect.of(effect, {}, world.gravity[0, :1]), {})
+
+
+def scale_spread(linear: Linearization) -> float | None:
+    """Return the standard deviation between the scales of sessions of a linearization; None without these."""
+    return next((p.prior[1] for p in linear.parameters if p.name.partition(".")[0] == NAME), None)
 
 
 def _with_scales(linear: Linearization, member: Array, width: float) -> Linearization:
@@ -82,7 +108,8 @@ def _with_scales(linear: Linearization, member: Array, width: float) -> Lineariz
 def _spread(linear: Linearization, count: int) -> float:
     """Return the standard deviation between the scales of sessions, beyond the errors of their differences.
 
-    All candidates are fitted beside them: a drag that the model lacks slows the flights of one session more.
+    The usual one counts for some degrees of freedom beside it, as in `falsification`. All candidates are fitted beside
+    them: a drag that the model lacks slows the flights of one session more.
     """
     own = [k for k, p in enumerate(linear.parameters) if p.name.partition(".")[0] == NAME]
     width = linear.parameters[own[0]].prior[1]
@@ -92,5 +119,6 @@ def _spread(linear: Linearization, count: int) -> float:
     centred = np.eye(count) - 1 / count
     scales = centred @ (covariance @ score)[own]
     errors = centred @ covariance[np.ix_(own, own)] @ centred
-    variance = (float(np.square(scales).sum()) - float(np.trace(errors))) / (count - 1)
-    return float(np.clip(np.sqrt(max(variance, 0.0)), LEAST_SPREAD * width, width))
+    found = max(float(np.square(scales).sum()) - float(np.trace(errors)), 0.0)
+    counts = LIMITS.model_counts
+    return min(math.sqrt((counts * LIMITS.usual_scale**2 + found) / (counts + count - 1)), width)

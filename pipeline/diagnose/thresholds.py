@@ -66,7 +66,8 @@ class FlightThresholds:
     slight: float = threshold(
         0.15,
         "usual sizes",
-        "an effect whose parameters all are below it needs BIC to fall by more than `slight_bic`",
+        "effects that explain the data equally well, one of which has all parameters below it, need the BIC of the "
+        "likeliest of them to fall by more than `slight_bic`",
         "development, reports 4 to 7",
         "takes away 5 names there, all false (sizes 0.03 to 0.11, changes of BIC -15 to 0); the smallest true one was "
         "0.22; on fresh seeds not measured alone",
@@ -111,6 +112,15 @@ class FlightThresholds:
         "captures 36 to 60 of a row, first step: 0 of 65 nulls wrong with each of the three",
         (0, 65),
     )
+    beyond_one: float = threshold(
+        2 * math.log(100),
+        "2 log odds",
+        "an effect that one episode shows above all, and that the others rather show than not (`rather`), counts where "
+        "it is likelier by more than this than a misfit of one episode, in which all effects may do anything: odds of "
+        "100",
+        "by argument: as `implausible`",
+    )
+    rather: float = threshold(0.5, "probability", "see `beyond_one`", BY_ARGUMENT)
     measured: float = threshold(
         0.04,
         "1",
@@ -230,10 +240,18 @@ class VerdictThresholds:
         3e-3,
         "rad",
         "usual standard deviation between episodes of how level frames are, which counts for `model_counts` degrees of "
-        "freedom beside their scatter; a tilt that all have is judged beside it at `flight.repeated_alpha`",
+        "freedom beside their scatter; a tilt that all have is judged beside it at `flight.repeated_alpha`, which is "
+        "not divided by the number of effects: levels look like a tilt alone",
         "by argument: a spirit level shows 0.5 to 1 mm/m, boards and grounds are worse",
         "real-like development: none of 4 forces in no library stays that was named a tilt, and of 4 tilts the one is "
         "lost that moves the body by 8 slow errors",
+    )
+    usual_scale: float = threshold(
+        3e-3,
+        "1",
+        "usual standard deviation between the scales of lengths of sessions, which counts for `model_counts` degrees "
+        "of freedom beside what flights show of it",
+        "by argument: calibrations with a board or a wand agree to some tenths of a per cent",
     )
     rest_frames: int = threshold(8, "frames", "fewest at the end of an episode that show how a body lies", BY_ARGUMENT)
     still_rad: float = threshold(
@@ -274,15 +292,16 @@ class VerdictThresholds:
     )
     consistent_share: float = threshold(0.9, "1", "see `consistent_p`", error_rates="see `consistent_p`")
     form_odds: float = threshold(
-        0.0,
+        -2 * math.log(2),
         "2 log odds",
-        "a force is not named, and alone it is `unexplained`, where other forms of it (during a part of the flights, "
-        "above a height, on one side of a place, by another power of speed or spin) are likelier than its own law by "
-        "more than this",
-        "by argument: as likely as not; at -1, 0 and 2, of 129 real-like development captures that hide what is in no "
-        "library 3, 5 and 9 get a wrong name (20 without), and 9, 6 and 2 of 80 true names are lost",
-        "29 further ones: 2 get a wrong name, a gust (before levels counted) and a cubic drag; real-like report9: "
-        "3 of 60, and 0 of 50 effects of flight and measurement get a wrong one, 25 their own",
+        "a force is not named, and alone it is `unexplained`, unless its own law is likelier by odds of 2 than other "
+        "forms of it (during a part of the flights, above a height, on one side of a place, by another power of speed "
+        "or spin)",
+        "by argument: a wrong name is worse than none; before likelihoods were those of Student's distribution, at -1, "
+        "0 and 2, of 129 real-like development captures that hide what is in no library 3, 5 and 9 got a wrong name "
+        "(20 without), and 9, 6 and 2 of 80 true names were lost",
+        "at 0, before: real-like report9, 3 of 60 get a wrong name, and 0 of 50 effects of flight and measurement, 25 "
+        "of which get their own",
     )
     unlike_fall: tuple[float, float] = threshold(
         (0.5, 8.0),

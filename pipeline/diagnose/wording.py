@@ -69,9 +69,14 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
 
 
 def _nearest(findings: Findings) -> str:
-    """Return which effects come near, and in what other form the flights fit them better; empty for none."""
-    forms = [form for form in findings.flight.others if form.likelier]
-    return "".join(f" Nearest is {form.effect}, but the flights fit {form.words} better." for form in forms)
+    """Return which effects come near, and in what other form the flights fit them as well or better; empty for none."""
+    words = []
+    for form in findings.flight.others:
+        if form.likelier and form.gain > 0:
+            words.append(f" Nearest is {form.effect}, but the flights fit {form.words} better.")
+        elif form.likelier:
+            words.append(f" Nearest is {form.effect}, but the flights hardly tell it from {form.words}.")
+    return "".join(words)
 
 
 def _called(findings: Findings) -> str:

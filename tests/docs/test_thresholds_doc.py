@@ -53,7 +53,6 @@ NUMERICS = {
     "form_fit.LEAST_SHARE": "keeps a matrix solvable",
     "form_fit.SINGULAR": "keeps a matrix solvable",
     "evidence.NEARLY": "rounding of a value at its bound",
-    "session_scales.LEAST_SPREAD": "keeps a matrix solvable",
     "contact_information.LEAST_STEP_S": "resolution of simulated motions",
     "contact_information.WEAK_SHARE": "keeps a matrix solvable",
     "coupled_effects.ITERATIONS": "bounds the duration of a refit",

@@ -11,7 +11,7 @@ import pytest
 import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.diagnose import diagnose, falsification, flight_search, stage
-from cgwm.pipeline.diagnose.effect_selection import SelectionStep, is_slight, repeats, select_next
+from cgwm.pipeline.diagnose.effect_selection import SelectionStep, are_slight, repeats, select_next
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.falsification import consistency, fitted_numbers, repetition
 from cgwm.pipeline.diagnose.flight_equals import fitted_contact, resolved_flight, separated
@@ -34,7 +34,7 @@ from cgwm.pipeline.trajectories.flight_noise import flight_noise, without_outlie
 from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import InputDataError
-from helpers.diagnosis_data import NOISE, tosses, world_with, write_capture
+from helpers.diagnosis_data import NOISE, evidence_of, tosses, world_with, write_capture
 from scipy.stats import kstest
 
 LIBRARY = [Candidate(name, load_effect(name)) for name in BUILT_IN]
@@ -402,7 +402,20 @@ def test_what_is_small_needs_more_evidence(size: float, delta_bic: float | None,
         delta_bic=delta_bic,
         numbers=numbers,
     )
-    assert is_slight(found) == slight
+    assert are_slight([found]) == slight
+
+
+def test_what_is_small_as_one_effect_is_told_by_the_evidence_of_the_likeliest_of_its_equals() -> None:
+    small, large = (
+        _refitted(name, size, bic) for name, size, bic in (("com_offset", 0.1, -15.0), ("wind", 0.5, -25.0))
+    )
+    assert are_slight([small]) and not are_slight([small, large]) and not are_slight([large, small])
+
+
+def _refitted(name: str, size: float, delta_bic: float) -> Evidence:
+    effect = load_effect(name)
+    numbers = {p.name: (size * p.scale, 0.0) for p in effect.parameters}
+    return replace(evidence_of(name), numbers=numbers, delta_bic=delta_bic)
 
 
 def one_parameter(information: np.ndarray, scores: np.ndarray) -> Linearization:
@@ -481,6 +494,29 @@ def test_the_scatter_of_all_effects_tells_what_that_of_one_may_be_by_chance() ->
     assert found.scatter == pytest.approx(limits.effects_count * usual / (limits.effects_count + 4))
     t = 10.0 / np.sqrt(5 * found.scatter)
     assert found.p_value == pytest.approx(2 * student_tail(t, limits.effects_count + 4), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("others", "named"), [((0.0,) * 11, True), ((4.0, -5.0, 3.0, 5.0, -4.0, 0, 3.0, 4.0, 0, 0, 0), False)]
+)
+def test_one_long_flight_tells_an_effect_from_a_misfit_that_can_look_like_anything(
+    others: tuple[float, ...], named: bool
+) -> None:
+    """One of five flights has nearly all the information; what it shows is one of twelve effects, or a bit of each."""
+    count, share = 1 + len(others), np.array([96.0, 1.0, 1.0, 1.0, 1.0])
+    first = one_parameter(share, np.array([60.0, 0.3, 0.3, 0.3, 0.3]))
+    scores = np.zeros((5, count))
+    scores[:, 0], scores[0, 1:] = first.score[:, 0], np.sqrt(96.0) * np.array(others)
+    linear = replace(
+        first,
+        parameters=tuple(replace(first.parameters[0], name=f"p{k}") for k in range(count)),
+        information=share[:, None, None] * np.eye(count),
+        score=scores,
+        prior=np.zeros(count),
+    )
+    found = repetition(linear, [0], 1.0, range(count))
+    assert found.without_best > THRESHOLDS.flight.without_best
+    assert (found.beyond_one > THRESHOLDS.flight.beyond_one) == named
 
 
 def test_steps_in_flight_are_short_enough_for_fine_measurements() -> None:

@@ -9,13 +9,14 @@ from cgwm.pipeline.diagnose.other_forms import OtherForms, other_forms
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.effect import BodyMotion, Effect, EffectParameter, Values, Wrench
 from cgwm.pipeline.physics.world import World
-from cgwm.pipeline.segments.candidates import base_parameters
+from cgwm.pipeline.segments.candidates import Candidate, base_parameters
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.segments.segment_fit import refit
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.diagnosis_data import tosses, world_with
 
 NOISE = Noise(3e-4, 1e-3)
+LIBRARY = ("gravity_scale", "gravity_tilt", "linear_drag", "magnus_lift", "spin_damping")
 
 
 class SpinDampingBySquare(Effect):
@@ -31,6 +32,19 @@ class SpinDampingBySquare(Effect):
         return Wrench(torque=-values["q"][:, None] * motion.omega.norm(dim=-1, keepdim=True) * momentum)
 
 
+class ForceByHeight(Effect):
+    """An upward acceleration f z, which is in no library."""
+
+    name = "force_by_height"
+    summary = formula = reveals = source = "a = f z"
+    parameters = (EffectParameter(name="f", unit="1/s2", scale=0.1, limit=5.0),)
+    phase = "flight"
+
+    def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
+        height = (motion.com * motion.up).sum(-1, keepdim=True)
+        return Wrench(force=motion.mass[:, None] * values["f"][:, None] * height * motion.up)
+
+
 def late(track: Track) -> Track:
     """Push the body upwards from 0.2 s on."""
     since = np.clip(track.time_s - 0.2, 0.0, None)
@@ -43,12 +57,22 @@ def form_of(truth: World, named: str, late_push: bool = False) -> OtherForms:
     if late_push:
         episodes = [(name, {body: late(track) for body, track in tracks.items()}) for name, tracks in episodes]
     plain = replace(truth, effects=())
+    return forms_of(plain, episodes, [named])[0]
+
+
+def forms_of(plain: World, episodes: list[tuple[str, dict[str, Track]]], names: list[str]) -> list[OtherForms]:
+    """Return the other forms of effects that are fitted to episodes."""
     prepared = prepare(plain, episodes, NOISE)
     assert prepared.flight is not None
-    world = replace(plain, effects=(ActiveEffect.of(load_effect(named), {}, plain.gravity[0, :1]),))
+    like = plain.gravity[0, :1]
+    named = [
+        ActiveEffect.of(load_effect(name), {c.name: c.default for c in load_effect(name).constants}, like)
+        for name in names
+    ]
+    world = replace(plain, effects=tuple(named))
     fitted = refit([prepared.flight], world, base_parameters(world, "flight"))
-    (found,) = other_forms(fitted.segments[0], fitted.world, [(named,)], 1.0)
-    return found
+    library = [Candidate(name, load_effect(name)) for name in LIBRARY]
+    return other_forms(fitted.segments[0], fitted.world, [(name,) for name in names], 1.0, library)
 
 
 @pytest.mark.parametrize(
@@ -68,6 +92,13 @@ def test_a_damping_by_the_square_of_the_spin_is_no_spin_damping() -> None:
     damped = replace(ball, effects=(ActiveEffect.of(SpinDampingBySquare(), {"q": 0.05}, ball.gravity[0, :1]),))
     found = form_of(damped, "spin_damping")
     assert found.likelier and found.words == "the same torque times the spin to the power 1"
+
+
+def test_a_force_by_height_is_not_two_effects_that_imitate_it_together() -> None:
+    ball, names = world_with("ball"), ["gravity_scale", "linear_drag"]
+    rising = replace(ball, effects=(ActiveEffect.of(ForceByHeight(), {"f": 1.0}, ball.gravity[0, :1]),))
+    found = forms_of(ball, tosses(rising, 3, 3, 0.4, 60.0, NOISE, (0.9, 1.2)), names)
+    assert found[0].likelier and found[0].words == "the same force times height"
 
 
 def test_what_is_no_force_has_no_other_form() -> None:

@@ -4,7 +4,8 @@ import pytest
 from cgwm.pipeline.diagnose.effect_selection import select_next
 from cgwm.pipeline.diagnose.falsification import repetition
 from cgwm.pipeline.diagnose.score_test import score_test
-from cgwm.pipeline.diagnose.session_scales import NAME, linearize_beside_scales
+from cgwm.pipeline.diagnose.session_scales import NAME, linearize_beside_scales, scale_spread
+from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.segments.candidates import Candidate, variants_of
 from cgwm.pipeline.segments.linearization import Linearization, linearize
@@ -51,3 +52,10 @@ def test_a_tilt_and_a_scale_are_no_constant_force_alone() -> None:
     assert prepared.flight is not None
     step = select_next(prepared.flight, world, CANDIDATES, GROUPS, True)  # pyright: ignore[reportArgumentType]
     assert [one.name for one in step.equals] == ["gravity_tilt", "constant_force"]
+
+
+def test_two_sessions_that_agree_hardly_tell_how_far_sessions_scatter() -> None:
+    """Their scales may differ by chance as little as here: the usual spread counts beside them."""
+    prepared, world = recorded((0.0, 0.0))
+    spread = scale_spread(both(prepared, world)[1])
+    assert spread is not None and 0.8 < spread / THRESHOLDS.verdict.usual_scale < 1.0
