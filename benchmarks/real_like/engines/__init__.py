@@ -5,7 +5,8 @@ A group is an engine with one setting of its contacts. `missing(group)` tells wh
 
 from __future__ import annotations
 
-from importlib.util import find_spec
+from functools import cache
+from importlib import import_module
 from typing import Any
 
 from cgwm.datasets.synthetic.hidden_effects import mujoco_engine
@@ -34,10 +35,15 @@ COMES_WITH = {"mujoco_graded": ("velocity_restitution",)}
 """Effects that a group's law of contact implies, beside what its engine declares."""
 
 
+@cache
 def missing(group: str) -> str | None:
-    """Return the package that a group's engine needs and that is not installed, or None."""
+    """Return the package that a group's engine needs and that is not installed, or lacks a library, or None."""
     package, module = _PACKAGES[ENGINE_OF[group]]
-    return None if find_spec(module) else package
+    try:
+        import_module(module)
+    except ImportError:
+        return package
+    return None
 
 
 def can_hide(group: str, name: str) -> bool:
