@@ -31,7 +31,8 @@ from ...schemas import (
     ResidualLaw,
     UsageError,
 )
-from ..physics.effects.registry import effect_names, load_effect, split_units
+from ..physics.effects.recording import no_recording
+from ..physics.effects.registry import effect_names, effect_of, load_effect, split_units
 from ..physics.rollout_cost import durations, segment_part
 from ..physics.world import World
 from ..report.page_file import shows_the_same
@@ -79,7 +80,6 @@ JOINTED = (
 _LESS = "name a split with fewer episodes, or use a model with a longer step_s."
 
 
-@torch.inference_mode()
 @one_torch_thread()
 @reads("model", "capture", "throws")
 def diagnose(
@@ -125,21 +125,22 @@ def diagnose(
     loaded = read_model(model)
     accepted = accept_units or loaded.accepts_units
     opened = Capture.open(capture, splits=(split,), accept_units=accepted)
-    note(f"diagnose: flights, contacts and noise of {len(opened.episodes(split))} episodes")
-    world, prepared = prepared_world(loaded, opened, split, device, accepted)
-    note(f"diagnose: {len(library)} effects")
-    result, findings = report_and_findings(prepared, world, library, compared)
-    if not loaded.file.articulations:
-        episodes = diagnosed_episodes(loaded, opened, split).episodes
-        result = _first_of_all(result, not_described(world, episodes, prepared.noise))
+    with no_recording([*(one.effect for one in library), *map(effect_of, loaded.file.effects)]):
+        note(f"diagnose: flights, contacts and noise of {len(opened.episodes(split))} episodes")
+        world, prepared = prepared_world(loaded, opened, split, device, accepted)
+        note(f"diagnose: {len(library)} effects")
+        result, findings = report_and_findings(prepared, world, library, compared)
+        if not loaded.file.articulations:
+            episodes = diagnosed_episodes(loaded, opened, split).episodes
+            result = _first_of_all(result, not_described(world, episodes, prepared.noise))
+        pictures = None if page is None else pictures_of(prepared, findings, result)
     if save_law_to is not None:
         present = [split_units(effect.name)[0] for effect in loaded.file.effects]
         result = result.model_copy(update={"saved_law": save_law(result, save_law_to, overwrite, present)})
-    if page is None:
+    if page is None or pictures is None:
         return result
     result = result.model_copy(update={"report": str(page)})
     note("diagnose: page")
-    pictures = pictures_of(prepared, findings, result)
     with new_file(page, "page", replaces) as path:
         then = shlex.join(next_command(result, Path(model), Path(capture), split))
         html = diagnosis_html(result, pictures, page, Path(model), Path(capture), split, then)

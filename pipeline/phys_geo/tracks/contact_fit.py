@@ -25,7 +25,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from ....datasets.capture.tracks import Episode, Track
 from ....datasets.io.progress import note
@@ -34,6 +33,7 @@ from ....schemas.materials import of_pair
 from ...optimization.importance_sampling import episode_covariance
 from ...physics.chain_parameters import chain_parameters
 from ...physics.effects import ActiveEffect, load_effect
+from ...physics.effects.recording import no_recording
 from ...physics.pair_laws import laws_in_use
 from ...physics.paper_law import PaperLaw
 from ...physics.parameters import (
@@ -90,7 +90,6 @@ NEVER_TOUCHES = (
 """Warning for a fit in which no body touches anything; the values are prior or earlier ones."""
 
 
-@torch.inference_mode()
 @one_torch_thread()
 def fit_physics(
     world: World,
@@ -125,12 +124,25 @@ def fit_physics(
     """
     _require_short_steps(config.step_s)
     note(f"phys-geo: motion of {len(episodes)} episode{'' if len(episodes) == 1 else 's'}")
-    data = _FitData.of(world, episodes, noise)
-    earlier = earlier or EarlierEstimates()
-    ready = _fitted_before(world, data, config, warm_started, groups, earlier, medians or {})
+    with no_recording(active.effect for active in world.effects):
+        data = _FitData.of(world, episodes, noise)
+        earlier = earlier or EarlierEstimates()
+        ready = _fitted_before(world, data, config, warm_started, groups, earlier, medians or {})
+        return _completed(_found(ready, data, config, warm_started, earlier, force_std_n), ready)
+
+
+def _found(
+    ready: _Ready,
+    data: _FitData,
+    config: PhysConfig,
+    warm_started: bool,
+    earlier: EarlierEstimates,
+    force_std_n: float | None,
+) -> PhysicsFit:
+    """Return the fit of the contact parameters, after the fits of mass distribution and effects."""
     batch = _with_initial_states(ready.world, data, config.warmup_s)
     record = FitRecord(
-        episodes=len(episodes),
+        episodes=len(data.episodes),
         search_episodes=len(data.searched),
         noise_estimated=data.noise_estimated,
         mass_distribution=None if ready.mass is None else ready.mass.record,
@@ -139,18 +151,16 @@ def fit_physics(
         bounces=None if data.bounces is None else data.bounces.to_json(),
     )
     if data.airborne:
-        found = _never_touching(ready, batch, data, record, earlier)
-    else:
-        estimate, record = _contact_estimate(ready, data, batch, config, warm_started, record)
-        if data.bounces is not None:
-            estimate = with_damping(estimate, damping_of(data.bounces))
-        forces = measured_forces(ready.world, data.searched, batch.observations, force_std_n)
-        if forces:
-            note("phys-geo: measured forces")
-            estimate, told = with_forces(ready.world, estimate, forces, batch.observations, batch.start_cov)
-            record = replace(record, forces=told)
-        found = physics_fit(ready.world, earlier.kept_in(ready.world, estimate), data.noise, record)
-    return _completed(found, ready)
+        return _never_touching(ready, batch, data, record, earlier)
+    estimate, record = _contact_estimate(ready, data, batch, config, warm_started, record)
+    if data.bounces is not None:
+        estimate = with_damping(estimate, damping_of(data.bounces))
+    forces = measured_forces(ready.world, data.searched, batch.observations, force_std_n)
+    if forces:
+        note("phys-geo: measured forces")
+        estimate, told = with_forces(ready.world, estimate, forces, batch.observations, batch.start_cov)
+        record = replace(record, forces=told)
+    return physics_fit(ready.world, earlier.kept_in(ready.world, estimate), data.noise, record)
 
 
 def _require_short_steps(step_s: float) -> None:

@@ -27,6 +27,8 @@ Phase = Literal["flight", "contact", "measurement"]
 """Where an effect acts."""
 Need = Literal["ground", "drag", "contact", "spin", "orientation", "driven"]
 """Requirements of an effect, see `Effect.needs`."""
+HOOKS = ("world", "flow", "wrench", "contact", "times", "observe")
+"""Methods of an effect; it overrides those that it needs."""
 
 
 @dataclass(frozen=True)  # not kw_only: effects of users pass name and unit by position

@@ -15,7 +15,8 @@ from typing import Any, Literal, cast, get_args
 
 from ....datasets.models.effect_files import effect_file, source_content
 from ....schemas import EffectModel, UsageError, did_you_mean
-from .effect import Effect, EffectConstant, EffectParameter, Need, Phase
+from .effect import HOOKS, Effect, EffectConstant, EffectParameter, Need, Phase
+from .recording import recording_itself
 from .trust import require_trust
 
 GROUP = "cgwm.effects"
@@ -66,7 +67,6 @@ CONTACT_ALIASES: tuple[frozenset[str], ...] = (
 """Groups that are equivalent in rigid contact too, since weight and friction scale alike."""
 Units = Literal["group", "episode"]
 """Scope of specific parameter values: a group of episodes, or one episode."""
-_HOOKS = ("world", "flow", "wrench", "contact", "times", "observe")
 
 
 def effect_names() -> list[str]:
@@ -222,7 +222,7 @@ def _checked(found: Any, spec: str) -> Effect:
     if fault:
         raise UsageError(f"{spec}: badly declared: {fault}.", todo="compare it with what 'cgwm effects new' writes.")
     try:
-        return found()
+        return recording_itself(found)()
     except Exception as error:  # a user's class may raise anything
         raise UsageError(
             f"{spec}: cannot be made: {type(error).__name__}: {error}.",
@@ -240,8 +240,8 @@ def _fault(kind: type[Effect]) -> str:
     fault = _word_fault(kind)
     if fault:
         return fault
-    if all(getattr(kind, hook) is getattr(Effect, hook) for hook in _HOOKS):
-        return f"it has none of the methods {', '.join(_HOOKS)}"
+    if all(getattr(kind, hook) is getattr(Effect, hook) for hook in HOOKS):
+        return f"it has none of the methods {', '.join(HOOKS)}"
     return _number_fault(kind)
 
 

@@ -146,7 +146,7 @@ def test_a_class_that_wants_arguments_is_refused(own: Path) -> None:
 
 def test_the_built_in_effects_are_the_files_of_the_folder() -> None:
     folder = Path(module.__file__).parent
-    others = {"__init__", "catalogue", "effect", "registry", "residual_wrench", "template", "trust"}
+    others = {"__init__", "catalogue", "effect", "recording", "registry", "residual_wrench", "template", "trust"}
     assert sorted(path.stem for path in folder.glob("*.py") if path.stem not in others) == sorted(BUILT_IN)
 
 
@@ -159,7 +159,7 @@ def test_one_effect_is_imported_without_the_others() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     names = {name.rpartition(".")[2] for name in quoted(done.stdout)}
-    assert names == {"effect", "registry", "trust", "wind"}
+    assert names == {"effect", "recording", "registry", "trust", "wind"}
 
 
 def quoted(text: str) -> list[str]:
