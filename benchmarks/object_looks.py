@@ -3,6 +3,7 @@
 PSNR over the pixels of the rendered or the true mask, as `cgwm eval` has it, a mean over frames of all episodes and
 cameras: the model at predicted and at true poses; the same under the true light; and the true scene itself, without
 noise, at predicted poses (no model of the appearance does better there, however exact) and at true ones (noise alone).
+The noise floor is the error of poses that the measurement of the start alone makes.
 Shares are those of the square error of the model at true poses: where the object is missing, where it spills over its
 outline, and inside, on sides that faced down in the photos (hidden) and on others; `share_inside_smooth` is what of the
 inside remains if errors are averaged over some 10 px: shading and tint, not texture. Run with
@@ -219,6 +220,7 @@ def looks(demo: Path, name: str, every: int, brief: bool) -> dict[str, Any]:
         **{part: round(value) for part, value in parts.items() if part.endswith("_px")},
         "translation_error_mm": round(1e3 * moved_m.median, 2),
         "rotation_error_deg": round(turned.median, 2),
+        "noise_floor_mm": round(float(np.median([1e3 * one.prediction.noise_floor_m for one in found.episodes])), 2),
     }
 
 
