@@ -32,11 +32,9 @@ def _of_chain(world: World, chain: Chain) -> list[Parameter]:
     bodies = moving_links(world, chain)
     if chain.base == "free":
         found += [_mass_share(name) for name in list(bodies)[1:]]
-    found.append(
-        _positive(
-            f"{chain.name}.inertia_factor", "1", 1.0, INERTIA_STD, (0.1, 10.0), "impacts that change the spins of links"
-        )
-    )
+    if chain.base == "free" or any(joint.kind == "hinge" for joint in chain.moving):  # slides alone turn nothing
+        reveals = "impacts that change the spins of links"
+        found.append(_positive(f"{chain.name}.inertia_factor", "1", 1.0, INERTIA_STD, (0.1, 10.0), reveals))
     return found
 
 

@@ -596,3 +596,4 @@ def test_a_drawer_is_pushed_by_its_losses_and_what_it_cannot_yield_to_does_not_a
     assert bodies == {box, pushed}  # the ground bears what the rail does
     force = found.contacts.impulse_n_s[0, -1][acting].sum(0) / 0.012
     np.testing.assert_allclose(force.abs().amax(), 2.0 + 8.0 * 0.2, rtol=0.02)  # along the normal: dry and viscous
+    assert [p.name for p in chain_parameters(world)] == ["rail.damping", "rail.friction"]  # a slide turns nothing
