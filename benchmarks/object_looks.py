@@ -209,7 +209,7 @@ def looks(demo: Path, name: str, every: int, brief: bool) -> dict[str, Any]:
                 at[f"model_at_{kind}"] += [] if compared is None else compared.psnr_object_db[MODEL].tolist()
     moved_m, turned = found.result.translation_error_m, found.result.rotation_error_deg
     assert moved_m is not None and turned is not None  # the test episodes have tracks
-    whole = sum(parts[part] for part in ("missing", "spilt", "inside_hidden", "inside_seen")) or 1.0
+    whole = sum(parts.get(part, 0.0) for part in ("missing", "spilt", "inside_hidden", "inside_seen")) or 1.0
     return {
         "demo": str(demo),
         "scene": truth.scene,
