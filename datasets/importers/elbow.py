@@ -7,23 +7,19 @@ apart. In the published tosses the angular velocity agrees with differences of t
 
 from __future__ import annotations
 
-import tarfile
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import Articulation, Ground, InputDataError, World
 from ...schemas.imports import ImportResult
-from ...schemas.regular_files import require_regular_file
 from ..capture.tracks import Track
 from ..io.atomic import new_directory
 from ..io.outputs import reads
 from ..robots import JointOfRobot, read_articulation
 from ..shapes.turns import matrix_of, quat_of_matrix
+from .archives import unpacked
 from .recordings import Recording, drawn_splits, write_recordings
 from .tensors import read_tensor
 
@@ -34,7 +30,6 @@ STEP_S = 0.0068
 NAME = "elbow"
 """Name of the jointed body, and of its file in the capture."""
 _COLUMNS = 15
-_MOST_BYTES = 1_000_000_000
 _TODO = "get assets/contactnets_elbow of github.com/DAIRLab/dair_pll."
 
 
@@ -63,7 +58,7 @@ def import_elbow(
         InputDataError: If the source is not such data.
         UsageError: If `out` exists, before anything is read.
     """
-    with new_directory(out, "capture", overwrite) as directory, _unpacked(Path(source)) as folder:
+    with new_directory(out, "capture", overwrite) as directory, unpacked(Path(source), (".pt", ".urdf")) as folder:
         urdf = _only_urdf(Path(source), folder)
         joint = _only_hinge(urdf)
         files = sorted(folder.rglob("*.pt"), key=_number)
@@ -74,37 +69,6 @@ def import_elbow(
         (directory / f"{NAME}.urdf").write_bytes(urdf.read_bytes())
         world, elbow = World(ground=Ground()), Articulation(name=NAME, urdf=f"{NAME}.urdf")
         return write_recordings(directory, out, world, (), recordings, splits, articulations=(elbow,))
-
-
-@contextmanager
-def _unpacked(source: Path) -> Iterator[Path]:
-    """Yield the folder, or that of the .pt and .urdf files of an archive."""
-    if source.is_dir():
-        yield source
-        return
-    with tempfile.TemporaryDirectory() as place:
-        try:
-            with tarfile.open(require_regular_file(source)) as archive:
-                for number, entry in enumerate(archive):
-                    name = PurePosixPath(entry.name)
-                    if not entry.isfile() or name.suffix not in (".pt", ".urdf"):
-                        continue
-                    if entry.size > _MOST_BYTES or number > 100_000:
-                        raise InputDataError(
-                            f"{source}: '{name}' is too large.",
-                            f"up to {_MOST_BYTES} bytes.",
-                            "take the original archive.",
-                        )
-                    content = archive.extractfile(entry)
-                    # names alone, so that nothing is written elsewhere
-                    (Path(place) / name.name).write_bytes(b"" if content is None else content.read())
-        except (tarfile.TarError, EOFError, OSError) as error:
-            if isinstance(error, InputDataError):
-                raise
-            raise InputDataError(
-                f"{source}: it is no archive that can be read.", "a folder, or a .tar.xz.", "download it again."
-            ) from None
-        yield Path(place)
 
 
 def _only_urdf(source: Path, folder: Path) -> Path:

@@ -15,7 +15,8 @@ MIT push (Yu et al., "More than a million ways to be pushed", IROS 2016): .json 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from ..io.atomic import new_directory
 from ..io.cells import shown
 from ..io.hdf5_files import hdf5_faults, open_hdf5, require_stored
 from ..io.outputs import reads
+from .archives import ENDINGS, unpacked
 from .recordings import (
     Recording,
     Units,
@@ -81,7 +83,8 @@ def import_pushes(
     Shapes, materials and, for MIT push, the mass are not in the files; the user adds them to the manifest.
 
     Args:
-        source: A .txt (MLab), .json or .h5 (MIT) file, a folder of them, or a folder of such folders.
+        source: A .txt (MLab), .json or .h5 (MIT) file, a folder of them, a folder of such folders, or a .tar (.gz, .xz)
+            of one.
         out: The capture directory to write.
         only: Name of one file without its ending.
         n_train: Number of pushes to fit on; None: 60 %.
@@ -93,8 +96,7 @@ def import_pushes(
         InputDataError: If the source is not such data.
         UsageError: If `out` exists, before anything is read.
     """
-    with new_directory(out, "capture", overwrite) as directory:
-        root = Path(source)
+    with new_directory(out, "capture", overwrite) as directory, _opened(Path(source)) as root:
         files = _chosen(_files(root), only)
         recordings, mlab = [], all(path.suffix.lower() == ".txt" for path in files)
         for path, group in zip(files, episode_names([_group(root, path) for path in files]), strict=True):
@@ -121,6 +123,18 @@ def read_pushes(path: Path) -> list[Push]:
         InputDataError: If it is not such data.
     """
     return _READERS[path.suffix.lower()](path)
+
+
+@contextmanager
+def _opened(source: Path) -> Iterator[Path]:
+    """Yield the source, of an archive the folder in it."""
+    if not source.name.lower().endswith(ENDINGS):
+        yield source
+        return
+    with unpacked(source, tuple(_READERS)) as folder:
+        if not any(folder.iterdir()):
+            raise InputDataError(f"{source}: no pushes in it.", f"files that end in {', '.join(_READERS)}.", _TODO)
+        yield folder
 
 
 def _files(source: Path) -> list[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tarfile
 from pathlib import Path
 
 import h5py
@@ -90,6 +91,15 @@ def test_one_file_of_a_folder(tmp_path: Path) -> None:
     assert import_pushes(folder, tmp_path / "both").episodes == 4
     assert import_pushes(folder, tmp_path / "one", only="b").episodes == 2
     assert import_pushes(folder.parent, tmp_path / "nested", only="a").episodes == 2
+    with tarfile.open(tmp_path / "all.tar.xz", "w:xz") as archive:
+        archive.add(folder.parent, "all")
+    import_pushes(tmp_path / "all.tar.xz", tmp_path / "packed", only="a")
+    manifests = [(tmp_path / name / "capture.toml").read_text() for name in ("nested", "packed")]
+    assert "in_a-00" in manifests[0] and manifests[0] == manifests[1]
+    with tarfile.open(tmp_path / "empty.tar", "w") as archive:
+        archive.add(tmp_path / "packed" / "capture.toml", "capture.toml")
+    with pytest.raises(InputDataError, match=r"empty\.tar: no pushes in it"):
+        import_pushes(tmp_path / "empty.tar", tmp_path / "none")
     groups = {entry.group for entry in Capture.open(tmp_path / "nested", check=False).manifest.episodes.values()}
     assert groups == {"in_a"}
     with pytest.raises(InputDataError, match=r"no file 'c' among a, b\."):
