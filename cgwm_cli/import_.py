@@ -72,8 +72,8 @@ def import_capture(
             "realsense: a .bag or .db3 of a RealSense camera; csv, tum, hdf5, rosbag: your own poses; contactnets: "
             "tosses of a cube (.pt files or .npz); pinwm: pushes of a block, with frames and masks; jugglebot: throws "
             "of a ball; balldrops: falling balls; pushes: a robot's finger that pushes an object, with forces (.txt of "
-            "MLab_EXP, .json or .h5 of MIT push, or a .tar.xz of them); elbow: tosses of two links with a hinge (folder "
-            "or .tar.xz of .pt files and a URDF).",
+            "MLab_EXP, .json or .h5 of MIT push, or a .tar.xz of them); elbow: tosses of two links with a hinge "
+            "(folder or .tar.xz of .pt files and a URDF).",
             show_default=False,
         ),
     ],
