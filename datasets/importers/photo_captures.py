@@ -43,11 +43,15 @@ def photos_in(folder: Path) -> list[Photo]:
     """
     files = [path for path in entries_of(folder) if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
     if not files:
-        others = sorted({path.suffix for path in entries_of(folder) if path.suffix})
+        entries = entries_of(folder)
+        others = sorted({path.suffix for path in entries if path.suffix})
+        posed = any(path.name == "transforms.json" for path in entries)
+        within = next((path for path in entries if path.name == "images" and path.is_dir()), None)
+        todo = "name the folder that holds them" + (f": {within}" if within else "")
         raise InputDataError(
             f"{folder}: no photos" + (f", but files {', '.join(others[:6])}." if others else "."),
             "photos .jpg, .jpeg, .png, .heic or .heif.",
-            "name the folder that holds them.",
+            f"{todo}, or with their cameras: cgwm import nerfstudio {folder}." if posed else f"{todo}.",
         )
     photos = [Photo(path, f"{path.stem}.jpg" if _is_heif(path) else path.name) for path in files]
     require_distinct(photos)

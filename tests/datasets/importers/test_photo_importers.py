@@ -265,6 +265,12 @@ def _spoil(path: Path, old: str, new: str) -> None:
 
 REFUSED = {
     "no photos": (lambda r: (r / "in").mkdir(), import_photos, "no photos."),
+    "photos in a folder of it": (lambda r: (r / "in" / "images").mkdir(parents=True), import_photos, "in/images."),
+    "photos with cameras": (
+        lambda r: (r / "in").mkdir() or (r / "in" / "transforms.json").write_text("{}"),
+        import_photos,
+        "cgwm import nerfstudio",
+    ),
     "two of one name": (
         lambda r: _photos(r / "in", ["a.jpg", "A.JPG".lower().replace("a", "A")]),
         import_photos,
