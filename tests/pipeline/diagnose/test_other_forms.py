@@ -1,10 +1,13 @@
 """A named force is told from forms of it that are in no library: one that sets in late, another power of the spin."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose import wording
 from cgwm.pipeline.diagnose.other_forms import OtherForms, other_forms
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.effect import BodyMotion, Effect, EffectParameter, Values, Wrench
@@ -99,6 +102,20 @@ def test_a_force_by_height_is_not_two_effects_that_imitate_it_together() -> None
     rising = replace(ball, effects=(ActiveEffect.of(ForceByHeight(), {"f": 1.0}, ball.gravity[0, :1]),))
     found = forms_of(ball, tosses(rising, 3, 3, 0.4, 60.0, NOISE, (0.9, 1.2)), names)
     assert found[0].likelier and found[0].words == "the same force times height"
+
+
+@pytest.mark.parametrize(
+    ("gain", "odds", "words"),
+    [
+        (3.0, 1.0, " Nearest is wind, but the flights fit the same force times x better."),
+        (-2.0, -1.0, " Nearest is wind, but the flights hardly tell it from the same force times x."),
+        (1.0, -2.0, ""),
+    ],
+)
+def test_the_sentence_says_in_which_other_form_a_force_comes_near(gain: float, odds: float, words: str) -> None:
+    form = OtherForms(effect="wind", words="the same force times x", gain=gain, odds=odds)
+    findings: Any = SimpleNamespace(flight=SimpleNamespace(others=[form]))
+    assert wording._nearest(findings) == words
 
 
 def test_what_is_no_force_has_no_other_form() -> None:
