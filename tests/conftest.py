@@ -38,6 +38,8 @@ def one_thread() -> Iterator[None]:
 def pytest_collection_finish() -> None:
     """Build the kernels of fits and rollouts with fewer optimisations; tests of the kernels themselves undo it.
 
+    Nor for vectors of rollouts, which change no bit, as another test says, and take the compiler four times as long.
+
     No tensor of a test is spread over machines; what torch loads to see that takes two seconds of each worker.
     """
     if "torch" in sys.modules:
@@ -48,7 +50,7 @@ def pytest_collection_finish() -> None:
         from cgwm.pipeline.physics.fused import host
         from helpers.fused_host import QUICK_FLAGS
 
-        host.FLAGS = QUICK_FLAGS
+        host.FLAGS, host.width = QUICK_FLAGS, lambda: 0
 
 
 LONGEST = (

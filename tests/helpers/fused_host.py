@@ -197,7 +197,7 @@ extern "C" int run(PARAMETERS) {
 """
 
 
-PRODUCT_FLAGS = host.FLAGS
+PRODUCT_FLAGS, PRODUCT_WIDTH = host.FLAGS, host.width
 LINKER = ("-fuse-ld=gold",) if shutil.which("ld.gold") else ()
 """The quickest linker that is here: a sixth of the time of a build."""
 QUICK_FLAGS = (*("-O1" if flag == "-O3" else flag for flag in PRODUCT_FLAGS), *LINKER)
@@ -206,9 +206,10 @@ QUICK_FLAGS = (*("-O1" if flag == "-O3" else flag for flag in PRODUCT_FLAGS), *L
 
 @contextmanager
 def built_as_for_users() -> Iterator[None]:
-    """Build the product's kernels with the flags that users have."""
+    """Build the product's kernels with the flags that users have, for vectors of rollouts where they have them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(host, "FLAGS", PRODUCT_FLAGS)
+        patch.setattr(host, "width", PRODUCT_WIDTH)
         host._library.cache_clear()
         yield
         host._library.cache_clear()

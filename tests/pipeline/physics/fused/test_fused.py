@@ -766,7 +766,8 @@ def test_the_kernel_is_taken_on_a_cpu_with_a_compiler(caplog: pytest.LogCaptureF
 
 
 @NEEDS_COMPILER
-def test_threads_change_no_bit_on_the_cpu() -> None:
+def test_threads_change_no_bit_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host, "width", fused_host.PRODUCT_WIDTH)
     world, state = world_of(box_body()), tossed(100)
     before = torch.get_num_threads()
     try:
@@ -793,11 +794,12 @@ def unlike(count: int) -> tuple[World, State]:
 
 
 @NEEDS_COMPILER
-@pytest.mark.skipif(host.width() == 0, reason="needs vectors of four numbers")
+@pytest.mark.skipif(fused_host.PRODUCT_WIDTH() == 0, reason="needs vectors of four numbers")
 @pytest.mark.parametrize("case", ["numbers", "effects"])
 def test_vectors_of_rollouts_change_no_bit_on_the_cpu(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
     world, state, frames = varied(21) if case == "numbers" else (*unlike(21), times(0.15))
     sorts = []
+    monkeypatch.setattr(host, "width", fused_host.PRODUCT_WIDTH)
     monkeypatch.setattr(host, "_order", lambda table: sorts.append(len(table)) or torch.randperm(len(table)).int())
     found = simulate_on_host(world, state, frames)
     assert sorts == [21]
