@@ -35,7 +35,7 @@ from typing import Any, Literal
 import numpy as np
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.tracks import Episode
-from cgwm.datasets.models.model import read_model
+from cgwm.datasets.models.model import Model, read_model
 from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.evaluate.evaluation import Evaluation
 from cgwm.pipeline.evaluate.stage import evaluate_model
@@ -198,21 +198,27 @@ def added(capture: Path, base: Path, child: Path, effects: Sequence[str], physic
     except CgwmError as error:
         return {"refit_failed": error.found}
     opened = Capture.open(capture, splits=("test",))
-    errors, ends_s = {}, _first_contacts(base, opened)
-    for when, path in (("before", base), ("after", child)):
-        found = evaluate_model(read_model(path), opened)
-        result = found.result
-        errors[when] = {
-            "flight_m": _in_flight(found, ends_s),
-            "floor_m": None if result.state_noise_floor_m is None else result.state_noise_floor_m.median,
-            "open_loop_m": result.translation_error_m.median,
-            "state_fitted_m": None if result.state_fitted_residual_m is None else result.state_fitted_residual_m.median,
-        }
+    ends_s = first_contacts(base, opened)
+    errors = {
+        when: errors_of_test(read_model(path), opened, ends_s) for when, path in (("before", base), ("after", child))
+    }
     own = {p.name: [p.estimate, p.interval_95] for p in model.parameters if "." in p.name and p.interval_95}
     return {"errors": errors, "estimates": own, "child_cpu_s": round(time.process_time() - began, 1)}
 
 
-def _first_contacts(base: Path, capture: Capture) -> dict[str, float]:
+def errors_of_test(model: Model, capture: Capture, ends_s: dict[str, float]) -> dict[str, float | None]:
+    """Return the median errors [m] of a model on the test split; `ends_s`: first contact of each episode [s]."""
+    found = evaluate_model(model, capture)
+    result = found.result
+    return {
+        "flight_m": _in_flight(found, ends_s),
+        "floor_m": None if result.state_noise_floor_m is None else result.state_noise_floor_m.median,
+        "open_loop_m": result.translation_error_m.median,
+        "state_fitted_m": None if result.state_fitted_residual_m is None else result.state_fitted_residual_m.median,
+    }
+
+
+def first_contacts(base: Path, capture: Capture) -> dict[str, float]:
     """Return the time of the first contact of each test episode [s], by the shape that a model has."""
     world = World.from_model(read_model(base))
     whole = whole_episodes(world, [Episode(name, capture.tracks(name)) for name in capture.episodes("test")])

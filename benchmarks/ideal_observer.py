@@ -16,6 +16,9 @@ nameable, too: no rule that seldom names anything wrong can have much more.
 of the library or none is hidden, how sizes are drawn (log-uniform over three decades) and that half of all captures
 hide nothing, names the class whose probability, given the flights, is above 95 %. `best` is the share of draws of the
 errors in which that is the class of the true effect. Nothing that is in no library confuses this observer.
+
+`errors` are those of the test split, as `missing_effects.py` has them, with the fitted model before, and with the true
+effects at their true numbers added: what no diagnosis can be better than, but by chance.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +41,7 @@ from cgwm.datasets.models.model import read_model
 from cgwm.datasets.synthetic.hidden_effects import EFFECTS
 from cgwm.pipeline.diagnose.stage import library_of, prepared_world
 from cgwm.pipeline.fit import fit
+from cgwm.pipeline.physics.effects.registry import load_effect
 from cgwm.pipeline.segments.candidates import acts_in, admissible, base_parameters, variants_of, with_variants
 from cgwm.pipeline.segments.linearization import derivatives
 from cgwm.pipeline.segments.prepare import whole_flights
@@ -45,7 +49,8 @@ from cgwm.pipeline.segments.segment_states import fit_states
 from cgwm.pipeline.segments.segments import Segments
 from cgwm.pipeline.trajectories.innovations import WHITE
 from cgwm.schemas import CgwmError
-from diagnose import base_settings
+from cgwm.schemas.model import EffectModel
+from diagnose import base_settings, errors_of_test, first_contacts
 from real_like import STAGES
 from real_like.errors import Errors, slow_correlation
 from real_like.score import EQUIVALENT, RIGHT, judge, rate, ratio_of
@@ -241,7 +246,22 @@ def observed(truth: dict[str, Any], capture: Path, model: Path) -> dict[str, Any
             c.effect.name for c in library_of(()) if [p.nonnegative for p in c.effect.parameters] == [True]
         )
         row["best"] = best_recall(found, truth["effects"][0], one_sided)
-    return row
+    return {**row, "errors": true_errors(truth, capture, model)}
+
+
+def true_errors(truth: dict[str, Any], capture: Path, model: Path) -> dict[str, Any]:
+    """Return the errors of the test split before, and with the true effects at their numbers added to the model."""
+    base, opened, effects = read_model(model), Capture.open(capture, splits=("test",)), []
+    for effect in truth["effects"]:
+        known = load_effect(effect["name"])
+        names = {number.name for number in (*known.parameters, *known.constants)}
+        values = {name: value for name, value in effect["values"].items() if name in names}
+        effects.append(EffectModel(name=effect["name"], parameters=values))
+    if any("drag" in load_effect(one.name).needs for one in effects):
+        return {}  # a wind acts through a drag, whose number the truth has under another name
+    added = replace(base, file=base.file.model_copy(update={"effects": (*base.file.effects, *effects)}))
+    ends_s = first_contacts(model, opened)
+    return {when: errors_of_test(one, opened, ends_s) for when, one in (("before", base), ("true", added))}
 
 
 def is_nameable(found: Sequence[float] | None) -> bool | None:
@@ -262,6 +282,14 @@ def table(rows: Sequence[dict[str, Any]], truths: dict[str, Any], answers: dict[
             error = 1.96 * float(np.std(best)) / np.sqrt(len(best))
             lines.append(f"ratio from {low:g} to {high:g}: the best observer names {np.mean(best):.0%} +- {error:.0%}")
         lines += _named(f"ratio from {low:g} to {high:g}", [row for row, one in told if one], truths, answers)
+    for key in ("open_loop_m", "flight_m"):
+        pairs = [(row["errors"]["before"][key], row["errors"]["true"][key]) for row in rows if row.get("errors")]
+        ratios = [after / before for before, after in pairs if before and after]
+        if ratios:
+            low, middle, high = np.percentile(ratios, (25, 50, 75))
+            lines.append(
+                f"test split, true effects / none, {key}: {middle:.2f} ({low:.2f} to {high:.2f}), n {len(ratios)}"
+            )
     pairs = [row for row in rows if len(row["limits"]) == 2]
     told = [(row, [is_nameable(one) for one in row["limits"].values()]) for row in pairs]
     told = [(row, both) for row, both in told if None not in both]
