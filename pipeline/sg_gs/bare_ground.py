@@ -6,6 +6,7 @@ ground, and what no photo shows would have any colour.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -23,8 +24,9 @@ from ..geometry.solid_grid import Array
 from ..geometry.spheres import Spheres
 from .cast_shadow import Caster, CastShadow, find_shadow
 from .context import Stage
-from .ground_photo import CELLS, GroundPhoto, photograph_ground
+from .ground_photo import CELLS, GroundPhoto, near_mask, photograph_ground
 from .initialization import to_spheres
+from .views import View
 
 _LARGEST = 0.15
 """Largest scale of a sphere of the ground, of the side of the grid; larger ones are backdrop."""
@@ -66,7 +68,7 @@ def bare_ground(stage: Stage, scene: Spheres, bodies: list[Spheres]) -> BareGrou
     hidden = _hidden(photo, solid)
     lit = photo.colors if shadow is None else photo.colors / dimmed(shadow.cover, shadow.factors).astype(np.float32)
     bare = _inpainted(lit, photo.seen, hidden)
-    scene = _without_insides(scene, solid)
+    scene = _without_insides(scene, solid, stage.train)
     if shadow is not None:
         scene = _lifted(scene, photo, shadow)
     scene = _filled(scene, photo, hidden, bare)
@@ -87,17 +89,36 @@ def _places(spheres: Spheres) -> tuple[Array, Array]:
     return means, scales
 
 
-def _without_insides(scene: Spheres, bodies: list[Array]) -> Spheres:
-    """Return the background without spheres that lie within the hull of a body's corners, to one scale of theirs.
+def _without_insides(scene: Spheres, bodies: list[Array], views: Sequence[View]) -> Spheres:
+    """Return the background without spheres that lie within a body and have its colours.
 
-    Photos show them at most through the body, so that they have its colours.
+    They lie within the hull of its corners, to one scale of theirs, and no photo shows them beside the masks, as it
+    shows what stands in a notch of the body.
     """
     means, scales = _places(scene)
     inside = np.zeros(len(scales), bool)
     for corners in bodies:
         planes = ConvexHull(corners).equations
         inside |= (means @ planes[:, :3].T + planes[:, 3] < scales[:, None]).all(1)
+    rows = np.flatnonzero(inside)
+    inside[rows] = _behind_masks(means[rows], views)
     return _rows(scene, torch.as_tensor(np.flatnonzero(~inside), device=scene.means.device))
+
+
+def _behind_masks(points: Array, views: Sequence[View]) -> NDArray[np.bool_]:
+    """Return which points (n, 3) [m], world frame, lie on a mask, or close to one, in all photos that hold them."""
+    kept = np.ones(len(points), bool)
+    for view in views:
+        if view.cover is None or not len(points):
+            continue
+        K, T = view.K.double().cpu().numpy(), view.viewmat.double().cpu().numpy()
+        local = points @ T[:3, :3].T + T[:3, 3]
+        pixels = np.floor((local @ K.T)[:, :2] / np.maximum(local[:, 2:], 1e-9)).astype(int)
+        width, height = view.size
+        held = (local[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < (width, height)).all(1)
+        masked = near_mask(view)
+        kept[held] &= masked[pixels[held, 1], pixels[held, 0]]
+    return kept
 
 
 def _hidden(photo: GroundPhoto, bodies: list[Array]) -> NDArray[np.bool_]:

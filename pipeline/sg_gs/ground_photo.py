@@ -92,13 +92,19 @@ def photograph_ground(ground: Ground, bodies: Array, views: Sequence[View]) -> G
     )
 
 
+def near_mask(view: View) -> NDArray[np.bool_]:
+    """Return the pixels (H, W) on the masks of a photo or so close that they mix body and ground."""
+    assert view.cover is not None
+    body = (view.cover.sum(0).cpu().numpy() > 0.01).astype(np.uint8)
+    return np.asarray(cv2.dilate(body, np.ones((2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1), np.uint8))) > 0
+
+
 def _on_ground(view: View, normal: Array, offset_m: float) -> tuple[Array, Array]:
     """Return the points on the ground (n, 3) [m] that a photo's pixels show beside all masks, and their colours."""
     image = view.image.detach().cpu().numpy()
-    free = np.ones(image.shape[:2], np.uint8) if view.seen is None else view.seen.cpu().numpy().astype(np.uint8)
+    free = np.ones(image.shape[:2], bool) if view.seen is None else view.seen.cpu().numpy()
     if view.cover is not None:
-        body = (view.cover.sum(0).cpu().numpy() > 0.01).astype(np.uint8)
-        free &= 1 - cv2.dilate(body, np.ones((2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1), np.uint8))
+        free &= ~near_mask(view)
     rows, columns = np.nonzero(free)
     rays, eye = view.rays(columns, rows), view.camera.center
     down = rays @ normal

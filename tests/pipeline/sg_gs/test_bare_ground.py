@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.geometry.ground_spheres import on_plane
 from cgwm.pipeline.geometry.spheres import Spheres
+from cgwm.pipeline.geometry.viewpoint import look_at
 from cgwm.pipeline.sg_gs import bare_ground as ground_module
 from cgwm.pipeline.sg_gs.cast_shadow import Caster, _cover, find_shadow
 from cgwm.pipeline.sg_gs.ground_photo import CELLS, GroundPhoto
@@ -78,11 +82,27 @@ def test_the_ground_in_a_notch_is_not_in_the_shadow() -> None:
     assert area < cover.sum() * CELL**2 < area + CELL * outline  # discs reach beyond the outline
 
 
+def _view(eye: np.ndarray, shape: tuple[int, int] = (96, 128)) -> SimpleNamespace:
+    """Return a photo from `eye` [m] towards the middle of the box, with the box's mask."""
+    T = np.linalg.inv(look_at(eye, np.array([0.0, 0.0, 0.05]), np.array([0.0, 0.0, 1.0])))
+    K = np.array([[150.0, 0, 64], [0, 150, 48], [0, 0, 1]])
+    local = BOX @ T[:3, :3].T + T[:3, 3]
+    corners = cv2.convexHull(((local @ K.T)[:, :2] / local[:, 2:]).astype(np.float32)).astype(np.int32)
+    mask = cv2.fillConvexPoly(np.zeros(shape, np.uint8), corners, 1)
+    cover = torch.as_tensor(mask)[None].float()
+    return SimpleNamespace(cover=cover, K=torch.as_tensor(K), viewmat=torch.as_tensor(T), size=shape[::-1])
+
+
 def test_what_lies_within_a_body_leaves_the_background() -> None:
-    places = [[0, 0, 0.05], [0.059, 0, 0.05], [0.0605, 0, 0.05], [0.07, 0, 0.05], [0, 0, 0.2]]
-    scene = Spheres(torch.tensor(places), torch.full((5,), 1e-3), torch.full((5,), 0.9), torch.rand(5, 3))
-    kept = ground_module._without_insides(scene, [BOX])
+    places = [[0, 0, 0.05], [0.059, 0, 0.05], [0.0605, 0, 0.05], [0.07, 0, 0.05], [0, 0, 0.2], [0.1, 0.1, 0.05]]
+    scene = Spheres(torch.tensor(places), torch.full((6,), 1e-3), torch.full((6,), 0.9), torch.rand(6, 3))
+    views: Any = [_view(np.array([0.4 * np.cos(a), 0.4 * np.sin(a), 0.3])) for a in (0.3, 1.9, 3.5, 5.0)]
+    kept = ground_module._without_insides(scene, [BOX], views)
     assert torch.equal(kept.means, scene.means[3:])
+    # what photos show beside the masks is in a notch of the body, though it is within its hull
+    around = np.concatenate([BOX, BOX + np.array([0.1, 0.1, 0.0])])
+    kept = ground_module._without_insides(scene, [around], views)
+    assert torch.equal(kept.means, scene.means[4:])
 
 
 def test_the_shadow_is_lifted_from_the_ground_alone_and_hidden_ground_is_covered() -> None:
