@@ -1,11 +1,12 @@
-"""Which numbers of a fit to one toss predict other tosses: those of the search, or those of multiple shooting.
+"""Which numbers of a fit to one motion predict others like it: those of the search, or those of multiple shooting.
 
     pip install --no-deps -r benchmarks/requirements.txt
     python benchmarks/search_or_shooting.py run --engines mujoco,dart,rapier --seeds 741,742 --workers 2
-    python benchmarks/search_or_shooting.py table
+    python benchmarks/search_or_shooting.py run --tasks push,tip --seeds 741 --workers 2
+    python benchmarks/search_or_shooting.py table --tasks push
 
-The tosses of `one_motion.py`: one motion of 15 noisy true poses, true shape and mass; both estimates of one fit predict
-four other tosses from 0.1 s of measurement. The table has a line for each value of `OPEN_LOOP_TOLERANCE`, the ratio of
+The motions of `one_motion.py`: one of 15 noisy true poses, true shape and mass; both estimates of one fit predict
+four others from 0.1 s of measurement. The table has a line for each value of `OPEN_LOOP_TOLERANCE`, the ratio of
 the open-loop errors up to which the numbers of shooting are kept.
 """
 
@@ -17,6 +18,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
@@ -36,7 +38,7 @@ from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import NotConvergedError, PhysConfig
 from one_motion import NOISE, noisy_episode, true_shape_world
 from store import Keyed, Store
-from tabletop.capture import plan_capture
+from tabletop.capture import Task, plan_capture
 from tabletop.engines import ENGINES, refusal
 from tabletop.materials import MATERIALS
 from tabletop.objects import load_item
@@ -53,13 +55,14 @@ class Job(Keyed):
     object: str
     material: str
     seed: int
+    task: Task = "fall"
 
 
 def measure_job(job: Job) -> dict[str, Any]:
     """Return both estimates of friction, the errors of their predictions, and the ratio that decides."""
     item = load_item(job.object)
     try:
-        plan = plan_capture(item, job.object, job.material, "fall", job.seed, TESTS, job.engine)[0]
+        plan = plan_capture(item, job.object, job.material, job.task, job.seed, TESTS, job.engine)[0]
         world, record, both = _estimates(plan, job.seed)
     except NotConvergedError as error:
         return vars(job) | {"not_run": error.found}
@@ -137,17 +140,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "table"))
     parser.add_argument("--engines", default="mujoco,dart,rapier", help=", ".join(ENGINES))
+    parser.add_argument("--tasks", default="fall", help="fall, push, tip")
     parser.add_argument("--seeds", default="310", help="of the captures; development seeds are below 500")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
+    parser.add_argument("--seconds", type=float, help="begin none after this time")
+    parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
     parser.add_argument("--any-commit", action="store_true", help="take up results of other commits, too")
     given = parser.parse_args()
-    store = Store("search_or_shooting", None, given.any_commit)
+    store, tasks = Store("search_or_shooting", given.store, given.any_commit), given.tasks.split(",")
     if given.what == "run":
         seeds = [int(seed) for seed in given.seeds.split(",")]
-        cells = product(given.engines.split(","), ("box", "l_block"), MATERIALS, seeds)
+        cells = product(given.engines.split(","), ("box", "l_block"), MATERIALS, seeds, tasks)
         wanted = [Job(*cell) for cell in cells if refusal(cell[0], load_item(cell[1]).solid) is None]
-        store.fill(measure_job, {job.key: (job,) for job in wanted}, given.workers)
-    print(table(store.results()))
+        store.fill(measure_job, {job.key: (job,) for job in wanted}, given.workers, given.seconds)
+    print(table([row for row in store.results() if row.get("task", "fall") in tasks]))
     return 0
 
 
