@@ -54,11 +54,6 @@ STOPPED = {
 GEOMETRY_WEIGHT = 1e-5
 """Cost of moving a sphere by one standard deviation of its prior, as a share of the image loss at the start. It fixes
 spheres that the motion does not identify, and hardly restrains the others (choice of cgwm)."""
-PRIOR_WEIGHT = 3e-3
-"""Cost of parameters one standard deviation away from the fit to the tracks, as a share of the image loss at the start.
-It takes that fit's whole posterior, so that numbers which the images hardly show stay where it left them: with this
-weight the pictures count as some 170 independent measurements of their loss, since errors of shape, light and law are
-shared by neighbouring pixels and frames."""
 PARAMETER_STEP, SPHERE_STEP = 0.03, 0.25
 """Steps of the differences: of a parameter (fitted coordinate), and of a sphere (standard deviations of its prior)."""
 
@@ -97,8 +92,6 @@ class ImageObjective:
     """Objective at the start."""
     geometry: ContactSpheres | None = None
     """Contact spheres that are fitted too (G coordinates, which follow the parameters), or None."""
-    prior: tuple[Tensor, Tensor] | None = None
-    """Mean (P,) and information (P, P) of the parameters by the fit to the tracks, in fitted coordinates, or None."""
 
     @property
     def moved(self) -> int:
@@ -141,12 +134,9 @@ class ImageObjective:
         return torch.cat([images, tracks[None]])
 
     def value(self, parts: Tensor, shared: Tensor) -> float:
-        """Return the objective from its parts, with the cost of moved spheres and parameters in `shared`."""
-        held_back = GEOMETRY_WEIGHT * float(shared[len(self.parameters) :].square().sum())
-        if self.prior is not None:
-            away = shared[: len(self.parameters)] - self.prior[0]
-            held_back += PRIOR_WEIGHT * float(away @ self.prior[1] @ away)
-        return float(parts[:2].sum()) / self.scale + TRACK_WEIGHT * float(parts[2]) + self.unit * held_back
+        """Return the objective from its parts, with the cost of the moved spheres in `shared`."""
+        held_back = GEOMETRY_WEIGHT * self.unit * float(shared[len(self.parameters) :].square().sum())
+        return float(parts[:2].sum()) / self.scale + TRACK_WEIGHT * float(parts[2]) + held_back
 
     def gradient(self, rollout: Rollout) -> Tensor:
         """Return the exact gradient (B, T, 6 nf) of the image loss by the free bodies' poses at the grid's frames."""
@@ -217,10 +207,6 @@ class ImageObjective:
         spheres = torch.arange(len(self.parameters), count)
         matrix[spheres, spheres] += 2 * GEOMETRY_WEIGHT * self.unit
         vector[spheres] += 2 * GEOMETRY_WEIGHT * self.unit * shared[spheres]
-        if self.prior is not None:
-            held, information = len(self.parameters), 2 * PRIOR_WEIGHT * self.unit * self.prior[1]
-            matrix[:held, :held] += information
-            vector[:held] += information @ (shared[:held] - self.prior[0])
         return matrix, vector
 
     def _tracks(self, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:

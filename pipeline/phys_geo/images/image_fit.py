@@ -253,9 +253,8 @@ def _covariance(names: Sequence[Parameter], fit: PhysicsFit) -> np.ndarray:
 
 def _refine(problem: ImageProblem, covariance: np.ndarray, config: PhysConfig) -> Refined:
     """Refine parameters within `TRUST_STD` of the fit to the tracks, and spheres within `SPHERES_LIMIT`."""
-    shared, count = problem.shared, len(problem.objective.parameters)
-    information = torch.linalg.pinv(torch.as_tensor(covariance), hermitian=True)
-    objective = replace(problem.objective, prior=(shared[:count].clone(), information))
+    objective, shared = problem.objective, problem.shared
+    count = len(objective.parameters)
     limits = torch.tensor([parameter.limits for parameter in objective.parameters], dtype=torch.float64)
     reach = TRUST_STD * torch.as_tensor(np.sqrt(np.diag(covariance)))
     low, high = (shared[:count] - reach).maximum(limits[:, 0]), (shared[:count] + reach).minimum(limits[:, 1])

@@ -140,9 +140,7 @@ def test_gradient_is_that_of_differences_through_contact(
         world, replace(rollout, position_m=rollout.position_m[:, -2:], quat_wxyz=rollout.quat_wxyz[:, -2:])
     )
     assert spheres.count >= 4
-    information = torch.tensor([[0.4, -0.12], [-0.12, 0.09]], dtype=torch.float64)
-    # so large a unit that what holds spheres and parameters counts as well
-    objective = replace(objective, geometry=spheres, unit=300.0, prior=(TRUTH, information))
+    objective = replace(objective, geometry=spheres, unit=300.0)  # so that what holds the spheres counts as well
     moved_spheres = 0.5 * torch.randn(spheres.count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     shared = torch.cat([TRUTH + torch.tensor([0.1, -0.15], dtype=torch.float64), moved_spheres])
     states = torch.zeros(1, 12, dtype=torch.float64)
