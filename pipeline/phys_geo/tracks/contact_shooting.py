@@ -146,7 +146,8 @@ def _descended(
 ) -> list[ShootingFit]:
     """Return the ends of the continued descents, the lowest cost first."""
     several = len(data.episodes) >= SEVERAL_EPISODES
-    problem = Shooting.of(world, parameters, data.episodes, data.spans, noise, prior, several)
+    whole = data.batch.observations
+    problem = Shooting.of(world, parameters, data.episodes, data.spans, noise, prior, several, whole=whole)
     best = 1 if several else BEST
     bar = progress(range(2 * len(starts) + best), "phys-geo: multiple shooting", total=2 * len(starts) + best)
     shown = iter(bar)

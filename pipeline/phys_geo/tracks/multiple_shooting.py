@@ -5,6 +5,11 @@ of some hundredths of a second they lead to the minimum. The segments of an epis
 the initial state of the next may differ by the expected error of the contact model, so that an impact that it cannot
 reproduce does not bias the parameters (Bock & Plitt 1984; with soft ties, weak-constraint assimilation, Tremolet 2006).
 The least-squares solver finds everything at once: the initial states of all segments and the parameters.
+
+A pushed body lies at the pusher, whose path it then follows under any friction; one that is off it by the noise of its
+track slides by itself and becomes slower by its friction. So descents of pushes begin at the motion that the world
+predicts, too: those from measured states end with the body off the pusher, at a higher cost. And their information is
+that at the predicted motion: of fitted states, which follow the noise, half are off the pusher.
 """
 
 from __future__ import annotations
@@ -125,6 +130,12 @@ class Shooting:
     """Alternative first guess of the states, which moves to the next frame in a straight line."""
     driven: Tensor
     """Whether a driven body may touch in the segment, shape (B,)."""
+    begins: Tensor
+    """Episode of each segment, and its frame at which the segment begins, shape (B, 2)."""
+    whole: Observations | None = None
+    """Episodes (E) with the states at their first frames, where bodies are driven; None where none is."""
+    expected: bool = False
+    """Whether motions count as measured where the states lead: for the information that is expected there."""
 
     @staticmethod
     def of(
@@ -136,11 +147,13 @@ class Shooting:
         prior: ShootingPrior,
         contacts_only: bool = False,
         segment_s: float = SEGMENT_S,
+        whole: Observations | None = None,
     ) -> Shooting:
         """Cut the span [s] of each episode into segments of at least `segment_s`; infinite, it is one.
 
         With `contacts_only`, segments without information on contact are left out: in flight or at rest, and not next
-        to a segment with such information. The first segments stay, because episodes begin with their states.
+        to a segment with such information. The first segments stay, because episodes begin with their states. Where
+        bodies are driven, the motion is predicted from the first states of the `whole` episodes.
         """
         tied = TiedSegments.of(world, episodes, spans, noise, contacts_only, segment_s)
         like = world.gravity
@@ -157,6 +170,8 @@ class Shooting:
             prior=prior,
             ahead=tied.ahead,
             driven=tied.driven,
+            begins=tied.begins,
+            whole=whole if whole is not None and whole.drives else None,
         )
 
     def fit(
@@ -184,7 +199,7 @@ class Shooting:
         """
         first = []
         for shared in starts:
-            for states in (self.segments.state, self.ahead):
+            for states in (self.segments.state, self._second_guess(shared)):
                 tied = replace(self, tie=self._allowed(shared, states))
                 first.append(tied._minimised(shared, states, iterations))
                 done()
@@ -205,6 +220,26 @@ class Shooting:
         end = descend(problem, start, Policy(iterations=iterations, relative=TOLERANCE))
         states = problem.by_segment(end.point.states)
         return self._shot(end, end.point.values[0], states), states
+
+    def _second_guess(self, shared: Tensor) -> State:
+        return self.ahead if self.whole is None else self._predicted(shared, self.whole, self.whole.state)
+
+    def _predicted(self, shared: Tensor, whole: Observations, first: State) -> State:
+        """Return the states (B) of segments in the motion that the world predicts from the first states (E)."""
+        world = self._world(shared[None])
+        with torch.no_grad():
+            motion = rolled_out(world, on_joints(world, first), true_times(world, whole.times_s), whole.drives)
+        moved = (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
+        return State(*(value[self.begins[:, 0], self.begins[:, 1]] for value in moved))
+
+    def _information(self, end: Descent, shared: Tensor, first: State) -> Tensor:
+        """Return the information (P, P) on parameters: at the end of a descent, or expected at the predicted motion."""
+        if self.whole is None:
+            return end.information()[0]
+        states = self._predicted(shared, self.whole, first)
+        problem = _TiedProblem(replace(self, tie=self._allowed(shared, states), expected=True))
+        start = Point(values=shared[None], states=problem.by_chain(states))
+        return descend(problem, start, Policy(iterations=0)).information()[0]
 
     def _allowed(self, shared: Tensor, states: State) -> Tensor:
         """Return the standard deviations (B, S) of the difference of states where segments meet."""
@@ -229,7 +264,7 @@ class Shooting:
         misfit, chi2 = self._misfits(shared, states)
         shot = ShootingFit(
             shared=shared,
-            covariance=torch.linalg.pinv(end.information()[0], hermitian=True),
+            covariance=torch.linalg.pinv(self._information(end, shared, states.at(first)), hermitian=True),
             state=states.at(first),
             cost=float(end.cost[0]) if bool(end.cost[0].isfinite()) else math.inf,
             costs=end.costs,
@@ -312,6 +347,7 @@ class Shooting:
         """Return residuals of frames (B, T nf, 6) and of ties (B, S), in sigmas."""
         size = self.tie.shape[1]
         tied = (self.following >= 0).to(rows)[:, None]
+        rows = torch.zeros_like(rows) if self.expected else rows
         return rows[:, :-size].unflatten(1, (-1, 6)), rows[:, -size:] / self.tie * tied
 
     def _differences(self, shared: Tensor, states: State) -> tuple[Tensor, Tensor]:

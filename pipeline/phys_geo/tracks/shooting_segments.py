@@ -44,6 +44,8 @@ class TiedSegments:
     """Alternative first guess of the states, which moves to the next frame in a straight line."""
     driven: Tensor
     """Whether a driven body may touch in the segment, shape (B,)."""
+    begins: Tensor
+    """Episode of each segment, and its frame at which the segment begins, shape (B, 2)."""
 
     @staticmethod
     def of(
@@ -75,6 +77,7 @@ class TiedSegments:
             end=torch.tensor(end),
             ahead=ahead,
             driven=_driven(world, whole, pieces),
+            begins=torch.tensor([piece[:2] for piece in pieces]),
         )
 
 
