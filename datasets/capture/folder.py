@@ -166,7 +166,11 @@ class CaptureFolder:
             if split not in self.manifest.splits:
                 legal = sorted(self.manifest.splits)
                 allowed = ", ".join(legal) + "." + did_you_mean(split, legal) if legal else "none: [splits] is empty."
-                raise UsageError(f"{self.root / 'capture.toml'}: no split '{split}'.", allowed, "name it in [splits].")
+                todo = "name it in [splits]." if legal else (
+                    "list its episodes in [splits], which are the names of tracks/<episode>.csv or of "
+                    "videos/<camera>/<episode>.mp4."
+                )  # fmt: skip
+                raise UsageError(f"{self.root / 'capture.toml'}: no split '{split}'.", allowed, todo)
             return list(self.manifest.splits[split])
         found = {path.stem for path in entries_of(self.root / "tracks") if path.suffix == ".csv"}
         for camera in _cameras(self.root / "videos"):

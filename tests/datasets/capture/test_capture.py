@@ -1,6 +1,7 @@
 """Captures: what is read from a good one, and the one message that each kind of bad input gets."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,9 @@ def test_unknown_names_are_answered_with_the_nearest(root: Path) -> None:
     assert str(caught.value).replace(str(root), "C") == (
         "C/capture.toml: no split 'tets'.\nAllowed: test, train. Did you mean 'test'?\nNext: name it in [splits]."
     )
+    bare = replace(capture, manifest=capture.manifest.model_copy(update={"splits": {}}))
+    with pytest.raises(UsageError, match=r"\[splits\] is empty\.\nNext: list its episodes in \[splits\]"):
+        bare.episodes("test")
     with pytest.raises(UsageError, match="no body 'cub'"):
         capture.body("cub")
     with pytest.raises(InputDataError, match="no video of episode '00'"):
