@@ -300,8 +300,8 @@ class VerdictThresholds:
         "by argument: a wrong name is worse than none; before likelihoods were those of Student's distribution, at -1, "
         "0 and 2, of 129 real-like development captures that hide what is in no library 3, 5 and 9 got a wrong name "
         "(20 without), and 9, 6 and 2 of 80 true names were lost",
-        "at 0, before: real-like report9, 3 of 60 get a wrong name, and 0 of 50 effects of flight and measurement, 25 "
-        "of which get their own",
+        "real-like report10: 3 of 25 get a wrong name, two of them drags above a speed, and 0 of 25 effects of flight "
+        "and measurement, 15 of which get their own; at 0, before, report9: 3 of 60, and 0 and 25 of 50",
     )
     unlike_fall: tuple[float, float] = threshold(
         (0.5, 8.0),
