@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 _CGROUPS, _OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-_POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+_POOLS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Variables from which the libraries take the number of their threads when they are loaded."""
 
 
@@ -41,8 +41,11 @@ def use_few_threads() -> None:
     """Have the libraries that are loaded from now on start no more threads than processors, and wait without spinning.
 
     OpenMP's threads spin by default while they wait for each other. On processors that other processes use, too, most
-    of the time went into that: a fit took five times the processor time. What is set in the environment stays.
+    of the time went into that: a fit took five times the processor time. Those of OpenBLAS, which numpy has, always
+    spin, and our matrices are too small to be shared out: a second thread took a sixth of a diagnosis's processor time.
+    What is set in the environment stays.
     """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("KMP_BLOCKTIME", "0")  # the same for LLVM's and Intel's OpenMP
     count = str(processors())

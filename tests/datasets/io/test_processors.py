@@ -76,13 +76,14 @@ GIVEN = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "ACTIVE"}
 
 @pytest.mark.parametrize("given", ["", "ACTIVE"])
 def test_waiting_is_passive_unless_the_user_says_otherwise(given: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("OMP_WAIT_POLICY", "KMP_BLOCKTIME", "OMP_NUM_THREADS"):
+    for name in ("OMP_WAIT_POLICY", "KMP_BLOCKTIME", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         monkeypatch.setenv(name, given)  # so that what is set below does not stay
         if not given:
             monkeypatch.delenv(name)
     use_few_threads()
     assert os.environ["OMP_WAIT_POLICY"] == (given or "PASSIVE") and os.environ["KMP_BLOCKTIME"] == (given or "0")
     assert os.environ["OMP_NUM_THREADS"] == (given or "64")
+    assert os.environ["OPENBLAS_NUM_THREADS"] == (given or "1")
 
 
 # In the suite: the test above, in this process.
@@ -93,5 +94,5 @@ def test_commands_wait_without_spinning_unless_the_user_says_otherwise(given: di
     said = subprocess.run([sys.executable, "-c", SAY], capture_output=True, text=True, check=True, env=clean | given)
     policy, threads, blas = said.stdout.split()
     assert policy == given.get("OMP_WAIT_POLICY", "PASSIVE")
-    assert threads == blas
+    assert blas == "1"
     assert int(threads) == 1 if given else int(threads) >= 1
