@@ -2,6 +2,7 @@
 
 import base64
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from cgwm.pipeline.rendering.contact_sheets import (
     separated,
     small_png,
     telling,
+    tiles,
 )
 
 
@@ -114,3 +116,13 @@ def test_a_picture_in_a_page_is_read_back_in_its_colours(made: Callable, kind: s
     data = np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8)
     read = cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]
     np.testing.assert_allclose(read, picture, atol=error)
+
+
+def test_the_true_outline_is_drawn_on_predictions_where_it_is_known_and_wanted() -> None:
+    frames, masks = np.full((2, 120, 160, 3), 90, np.uint8), np.zeros((2, 120, 160), np.uint8)
+    masks[:, 40:80, 60:110] = 1
+    known = FrameStrip(episode="a", camera="c", times_s=np.arange(2.0), real=frames, predicted=frames, masks=masks)
+    marked = {outlined: tiles(known, outlined=outlined) for outlined in (True, False)}
+    plain = tiles(replace(known, masks=None))
+    assert (marked[True][0] == 90).all() and (marked[True][1] != 90).any()
+    assert all((pictures == 90).all() for pictures in (*marked[False], *plain))

@@ -51,6 +51,7 @@ def test_bodies_shade_together_and_only_spheres_of_the_ground() -> None:
     red = 1 - 0.5 * OPACITY
     assert one[0, 0, 0] == pytest.approx(red, abs=4e-3) and (one[0, 1] == 1).all()
     assert two[0, 0, 0] == pytest.approx(1 - 0.5 * (1 - (1 - OPACITY) ** 2), abs=4e-3)
+    assert ShadedGround.visible(one[0]).tolist() == [True, False]
     colors = shaded.shaded(still, one[0]).colors
     assert torch.equal(colors[1:], still.colors[1:]) and (colors[0] < still.colors[0]).all()
 

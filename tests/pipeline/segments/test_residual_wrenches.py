@@ -285,6 +285,10 @@ def test_turning_is_more_than_its_noise() -> None:
         assert _turns(seen_motion(torch.zeros(1, 3, 3, dtype=F64), quat), sigma) is found
     unknown = seen_motion(torch.zeros(1, 3, 3, dtype=F64), quat * 9, torch.zeros(1, 3, dtype=F64))
     assert not _turns(unknown, sigma)
+    still = torch.tensor([[[1.0, 0, 0, 0], [0, 1.0, 0, 0], [-1.0, 0, 0, 0]]], dtype=F64)
+    for second in (0.0, 1.0):  # whether the orientation of that frame was measured
+        partly = seen_motion(torch.zeros(1, 3, 3, dtype=F64), still, torch.tensor([[1.0, second, 1.0]], dtype=F64))
+        assert _turns(partly, sigma) is (second > 0)
 
 
 @pytest.mark.parametrize(("tilt", "offset_m", "found"), [(0.9, 0.0, True), (1.1, 0.0, False), (0.5, -0.05, False)])
