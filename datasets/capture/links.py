@@ -70,7 +70,7 @@ def _require_link(path: Path, link: LinkOfRobot) -> None:
     if not link.geometry:
         raise InputDataError(
             f"{path}: link '{link.name}' has no collision geometry, so nothing could touch it.",
-            "<collision> with a box, sphere, cylinder or mesh.",
+            "a box, sphere, cylinder or mesh: <collision> of a URDF, a <geom> of an MJCF that collides.",
             "add one.",
         )
 

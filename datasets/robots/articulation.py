@@ -164,7 +164,7 @@ class Articulation:
             if link.mass_kg > 0 and not link.geometry:
                 raise InputDataError(
                     f"{self.path}: link '{link.name}' has no collision geometry, so nothing could touch it.",
-                    "<collision> with a box, sphere, cylinder or mesh.",
+                    "a box, sphere, cylinder or mesh: <collision> of a URDF, a <geom> of an MJCF that collides.",
                     "add one, or ask for links without it by bare_links=True.",
                 )
 

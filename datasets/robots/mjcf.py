@@ -32,7 +32,7 @@ def read_mjcf(path: Path) -> Articulation:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise InputDataError(
-            f"{path}: MuJoCo cannot read it: {error}.",
+            f"{path}: MuJoCo cannot read it: {' '.join(str(error).split()).rstrip('.')}.",
             "an MJCF file.",
             "open the file in MuJoCo's viewer, which names the fault, and correct it.",
         ) from error
