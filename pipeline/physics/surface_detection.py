@@ -10,6 +10,9 @@ from torch import Tensor
 from .contact_detection import Placed, Points, emptied, plain
 from .fixed_surface import HALF_SPACE, FixedSurface
 
+MOST_GAP_M = 0.1
+"""Gap between a body and a surface up to which `surface_gap` tells it."""
+
 
 @dataclass(frozen=True)
 class Nearby:
@@ -97,6 +100,18 @@ def surface_depth(placed: Placed, surface: FixedSurface) -> Tensor:
     zero = torch.zeros_like(plain(placed.reference)[:, 0])
     nearby = near_surface(placed, surface, zero)
     return zero if nearby is None else -nearby.depth.amin(-1).clamp_max(0.0)
+
+
+@torch.no_grad()
+def surface_gap(placed: Placed, surface: FixedSurface) -> Tensor:
+    """Return the gap (n,) [m] of a body to a surface, negative where they overlap; infinite above `MOST_GAP_M`."""
+    still, fixed = placed.plain(), _plain(surface)
+    zero = torch.zeros_like(still.reference[:, 0])
+    near = fixed.bound(still.reference[:, None]).squeeze(1) - still.reach < MOST_GAP_M
+    if not bool(near.any()):
+        return zero + torch.inf
+    gap = _nearby(still, fixed, zero, zero + MOST_GAP_M).depth.amin(-1)
+    return torch.where(near & (gap < MOST_GAP_M), gap, torch.inf)
 
 
 def _chosen(placed: Placed, surface: FixedSurface) -> Tensor | None:

@@ -10,7 +10,9 @@ from torch import Tensor
 from ..geometry.rotation import continuous_turns, quat_to_matrix
 from ..optimization.levenberg_marquardt import Solution, minimise
 from ..physics.chain_state import on_joints
+from ..physics.contact_detection import Placed
 from ..physics.smooth_distance import union_distance
+from ..physics.surface_detection import surface_gap
 from ..physics.world import Body, World
 from .observations import START_FRAMES, Observations, straight_line
 from .residuals import STATE_SIZE, TrajectoryResiduals, retract, state_prior
@@ -28,7 +30,7 @@ LINE_SPREAD = 2.0
 
 
 def clearance(world: World, observations: Observations) -> Tensor:
-    """Return the smallest measured gap (B, T) [m] of any free body to the ground or to a kinematic or fixed body."""
+    """Return the smallest measured gap (B, T) [m] of any free body to the ground, a surface or another body."""
     gaps = []
     for column, index in enumerate(observations.free):
         body = world.bodies[index]
@@ -48,6 +50,8 @@ def clearance(world: World, observations: Observations) -> Tensor:
         for other in world.bodies:
             if other.motion == "fixed" and other.place is not None:
                 gaps.append(_gap_to_fixed(other, centers, body.radii))
+        if world.surfaces and body.radii.shape[-1]:
+            gaps.append(_gap_to_surfaces(world, body, observations.position_m[:, :, column], rotation))
     if not gaps:
         return torch.full_like(observations.times_s, torch.inf)
     return torch.stack(gaps).amin(0)
@@ -60,6 +64,15 @@ def _gap_to_fixed(other: Body, centers: Tensor, radii: Tensor) -> Tensor:
     points = place[:, None, :3] + other.centers[:1] @ quat_to_matrix(place[:, 3:]).transpose(-1, -2)
     away = torch.cdist(centers.flatten(0, -2), points[0]) - other.radii[:1]
     return (away.amin(-1).view(centers.shape[:-1]) - radii[0]).amin(-1)
+
+
+def _gap_to_surfaces(world: World, body: Body, origin: Tensor, rotation: Tensor) -> Tensor:
+    """Return the smallest gap (B, T) [m] of a body at origins (B, T, 3) to the fixed surfaces, as `surface_gap`."""
+    turned = rotation.flatten(0, 1)
+    place = origin.flatten(0, 1) + turned @ body.com[0]
+    still = torch.zeros_like(place)
+    found = [surface_gap(Placed(body, place, turned, still, still), surface) for surface in world.surfaces]
+    return torch.stack(found).amin(0).view(origin.shape[:2])
 
 
 def flight_frames(world: World, observations: Observations) -> Tensor:

@@ -10,8 +10,11 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.phys_geo.surface_starts import require_outside
+from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.chain import Chain, Joint
+from cgwm.pipeline.physics.contact_detection import Placed
 from cgwm.pipeline.physics.fixed_surface import KINDS, FixedSurface
+from cgwm.pipeline.physics.surface_detection import surface_gap
 from cgwm.schemas import InputDataError
 from helpers.chains import chained, link
 from helpers.worlds import batch
@@ -25,8 +28,8 @@ def capture_of(heights_m: tuple[float, ...], quat: np.ndarray | None) -> Any:
     return SimpleNamespace(root=Path("C"), episodes=lambda split: ("one",), tracks=lambda name: {"lower": track})
 
 
-@pytest.mark.parametrize("quat", [np.array([[1.0, 0.0, 0.0, 0.0]]), None])  # None: a ball without orientation
-def test_a_link_that_begins_deep_inside_a_surface_is_refused(quat: np.ndarray | None) -> None:
+def resting() -> World:
+    """Return two links, of which the second has a sphere of 20 mm, and a table at height 0."""
     spheres = ((0.0, 0.0, 0.0, 0.02),)
     chain = Chain(name="arm", root="upper", base="free", joints=(Joint.of("hinge", "hinge", "lower", "upper"),))
     table = FixedSurface(
@@ -36,10 +39,25 @@ def test_a_link_that_begins_deep_inside_a_surface_is_refused(quat: np.ndarray | 
         quat_wxyz=batch([1.0, 0.0, 0.0, 0.0]),
         size=batch([0.0] * 3),
     )
-    world = replace(chained(chain, link("upper"), link("lower", spheres=spheres)), surfaces=(table,))
+    return replace(chained(chain, link("upper"), link("lower", spheres=spheres)), surfaces=(table,))
+
+
+@pytest.mark.parametrize("quat", [np.array([[1.0, 0.0, 0.0, 0.0]]), None])  # None: a ball without orientation
+def test_a_link_that_begins_deep_inside_a_surface_is_refused(quat: np.ndarray | None) -> None:
+    world = resting()
     assert torch.equal(world.bodies[0].radii, torch.zeros(1, 0))  # a link without spheres touches nothing
     assert require_outside(world, capture_of((0.018, 0.03), quat), "train") == []
     (warning,) = require_outside(world, capture_of((0.018, 0.012, 0.03), quat), "train")
     assert "lower passes through the surface 'table' in 1 episode: 8.0 mm deep in episode 'one' at 0.10 s" in warning
     with pytest.raises(InputDataError, match=r"'table': in episode 'one', 'lower' begins 40\.0 mm deep inside it"):
         require_outside(world, capture_of((-0.02, 0.03), quat), "train")
+
+
+def test_a_link_on_a_surface_does_not_fly() -> None:
+    world = resting()
+    heights = (0.15, 0.05, 0.02, 0.01, np.nan)
+    body = world.bodies[1]
+    places = torch.tensor([[0.0, 0.0, height] for height in heights], dtype=torch.float64)
+    turns, still = torch.eye(3, dtype=torch.float64).expand(5, 3, 3), torch.zeros(5, 3, dtype=torch.float64)
+    gap = surface_gap(Placed(body, places, turns, still, still), world.surfaces[0])
+    np.testing.assert_allclose(gap, [np.inf, 0.03, 0.0, -0.01, np.inf], atol=1e-12)
