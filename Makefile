@@ -70,9 +70,9 @@ evidence: install
 	cd tests && for what in '--cases 3000 --seed 1' '--table refuse' '--table accept'; do echo "== fuzz $$what"; OMP_NUM_THREADS=1 PYTHONSAFEPATH=1 PYTHONPATH=. ../$(BIN)/python -m fuzz $$what --failures ../out/evidence/fuzz || echo "fuzz: a bar was missed"; done
 	cd benchmarks && for one in calibrate tosses fall coverage known_mesh next_throw real_data; do echo "== $$one"; ../$(BIN)/python $$one.py || echo "$$one: a bar was missed"; done
 
-results:
-	$(PYTHON) benchmarks/render_results.py
-	$(PYTHON) benchmarks/engine_page.py
+results: install
+	$(BIN)/python benchmarks/render_results.py
+	$(BIN)/python benchmarks/engine_page.py
 
 clean:
 	rm -rf $(VENV) build out dist *.egg-info .pytest_cache .ruff_cache
