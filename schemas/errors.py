@@ -93,5 +93,6 @@ def did_you_mean(name: str, legal: Iterable[str]) -> str:
     """Return `` Did you mean 'x'?`` with the nearest legal name, or an empty string."""
     if len(name) > LONGEST_NAME:
         return ""
-    near = difflib.get_close_matches(name, list(legal), n=1, cutoff=0.5)
-    return f" Did you mean '{near[0]}'?" if near else ""
+    bare = {one.lstrip("-"): one for one in legal}  # the dashes of options make all of them alike
+    near = difflib.get_close_matches(name.lstrip("-"), bare, n=1, cutoff=0.5)
+    return f" Did you mean '{bare[near[0]]}'?" if near else ""

@@ -187,6 +187,10 @@ def test_an_unknown_option(run: Run) -> None:
     )
 
 
+def test_dashes_alone_make_no_option_like_another(run: Run) -> None:
+    assert "Did you mean" not in run("compare", "model", "capture", "--page")[2]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
