@@ -57,7 +57,7 @@ def calibrate_target(folder: Path | str, overwrite: bool = False) -> IntrinsicsF
 
     Args:
         folder: Photos of the board, .jpg or .png, of one camera at one focal length.
-        overwrite: Replace intrinsics that were written before.
+        overwrite: Replace intrinsics that were written before. Otherwise those are kept that the same photos gave.
 
     Returns:
         The intrinsics, with standard deviations and the errors of photos that were held out.
@@ -65,13 +65,22 @@ def calibrate_target(folder: Path | str, overwrite: bool = False) -> IntrinsicsF
     Raises:
         InputDataError: If the photos are of several sizes or lenses, or too few of them show the board.
         NotConvergedError: If no intrinsics explain them.
-        UsageError: If intrinsics are there, and `overwrite` is not set.
+        UsageError: If other intrinsics are there, and `overwrite` is not set.
     """
     folder = Path(folder)
-    with new_file(folder / INTRINSICS_NAME, "intrinsics", overwrite) as temporary:
+    path = folder / INTRINSICS_NAME
+    if path.is_file() and not overwrite:
         file = _measured(folder)
-        temporary.write_text(file.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        if path.read_bytes() == _text(file).encode():
+            return file
+    with new_file(path, "intrinsics", overwrite) as temporary:
+        file = _measured(folder)
+        temporary.write_text(_text(file), encoding="utf-8")
     return file
+
+
+def _text(file: IntrinsicsFile) -> str:
+    return file.model_dump_json(indent=1) + "\n"
 
 
 def _measured(folder: Path) -> IntrinsicsFile:
@@ -134,10 +143,14 @@ def _fitted(seen: Sequence[_Seen], size: tuple[int, int]) -> _Fit:
     boards = [one.board_mm.astype(np.float32) for one in seen]
     pixels = [one.pixels.astype(np.float32)[:, None] for one in seen]
     K, lens = np.eye(3), np.zeros(5)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # sums of several threads differ in the last digits from run to run
     try:
         _, K, lens, _, _, stds, _, errors = cv2.calibrateCameraExtended(boards, pixels, size, K, lens, flags=_LENS)
     except cv2.error as error:
         raise _no_camera(str(error.err)) from None
+    finally:
+        cv2.setNumThreads(threads)
     values = np.concatenate([np.ravel(K), np.ravel(lens)[:4], np.ravel(stds)[:8]])
     if not np.isfinite(values).all() or min(K[0, 0], K[1, 1]) <= 0:
         raise _no_camera("the fit diverged")

@@ -32,6 +32,18 @@ def file(board: Path) -> IntrinsicsFile:
     return calibrate_target(board)
 
 
+def test_the_same_photos_keep_their_intrinsics_and_others_are_not_replaced(board: Path, file: IntrinsicsFile) -> None:
+    path = board / "intrinsics.json"
+    made = path.stat().st_mtime_ns
+    assert (calibrate_target(board), path.stat().st_mtime_ns) == (file, made)
+    text = path.read_text()
+    path.write_text("mine")
+    with pytest.raises(OutputExistsError):
+        calibrate_target(board)
+    assert path.read_text() == "mine"
+    path.write_text(text)
+
+
 def test_the_printed_sheet_is_opencvs_board() -> None:
     corners, identifiers, _, _ = cv2.aruco.CharucoDetector(charuco_board()).detectBoard(sheet())
     assert len(identifiers) == 54
