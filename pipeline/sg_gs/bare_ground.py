@@ -111,13 +111,8 @@ def _behind_masks(points: Array, views: Sequence[View]) -> NDArray[np.bool_]:
     for view in views:
         if view.cover is None or not len(points):
             continue
-        K, T = view.K.double().cpu().numpy(), view.viewmat.double().cpu().numpy()
-        local = points @ T[:3, :3].T + T[:3, 3]
-        pixels = np.floor((local @ K.T)[:, :2] / np.maximum(local[:, 2:], 1e-9)).astype(int)
-        width, height = view.size
-        held = (local[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < (width, height)).all(1)
-        masked = near_mask(view)
-        kept[held] &= masked[pixels[held, 1], pixels[held, 0]]
+        held, columns, rows = view.camera.resized(*view.size).pixels_of(points)
+        kept[held] &= near_mask(view)[rows[held], columns[held]]
     return kept
 
 

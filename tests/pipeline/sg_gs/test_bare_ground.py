@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from cgwm.datasets.capture.cameras import Camera
 from cgwm.pipeline.geometry.ground_spheres import on_plane
 from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.geometry.viewpoint import look_at
@@ -84,13 +85,13 @@ def test_the_ground_in_a_notch_is_not_in_the_shadow() -> None:
 
 def _view(eye: np.ndarray, shape: tuple[int, int] = (96, 128)) -> SimpleNamespace:
     """Return a photo from `eye` [m] towards the middle of the box, with the box's mask."""
-    T = np.linalg.inv(look_at(eye, np.array([0.0, 0.0, 0.05]), np.array([0.0, 0.0, 1.0])))
+    pose = look_at(eye, np.array([0.0, 0.0, 0.05]), np.array([0.0, 0.0, 1.0]))
     K = np.array([[150.0, 0, 64], [0, 150, 48], [0, 0, 1]])
-    local = BOX @ T[:3, :3].T + T[:3, 3]
-    corners = cv2.convexHull(((local @ K.T)[:, :2] / local[:, 2:]).astype(np.float32)).astype(np.int32)
+    camera = Camera(*shape[::-1], K, np.zeros(0), pose)
+    corners = cv2.convexHull(camera.project(BOX)[0].astype(np.float32)).astype(np.int32)
     mask = cv2.fillConvexPoly(np.zeros(shape, np.uint8), corners, 1)
     cover = torch.as_tensor(mask)[None].float()
-    return SimpleNamespace(cover=cover, K=torch.as_tensor(K), viewmat=torch.as_tensor(T), size=shape[::-1])
+    return SimpleNamespace(cover=cover, camera=camera, size=shape[::-1])
 
 
 def test_what_lies_within_a_body_leaves_the_background() -> None:
