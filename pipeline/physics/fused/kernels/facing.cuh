@@ -280,8 +280,6 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
     for (int n = 0; n < found.near_b.count; n++) found.placed_b[n] = edge_in(found, hull_b, found.near_b.edge(n));
     found.met_count = 0;
     found.marks = 0;
-#endif
-#if HOST
     Edge placed_a[NEAR_ROOM];
     for (int m = 0; m < found.near_a.count; m++) placed_a[m] = edge_of(hull_a, found.near_a.edge(m));
 #endif
