@@ -103,7 +103,5 @@ def _placed(world: World, index: int, track: Track, rows: np.ndarray) -> Placed:
     if track.quat_wxyz is not None:
         measured = np.asarray(track.quat_wxyz, float)[rows]
         quat = np.where(np.isfinite(measured).all(1, keepdims=True), measured, quat)
-    rotation = quat_to_matrix(torch.as_tensor(quat).to(world.gravity))
     origin = torch.as_tensor(np.asarray(track.position_m, float)[rows]).to(world.gravity)
-    reference = origin + (rotation @ body.com[..., None]).squeeze(-1)
-    return Placed(body, reference, rotation, torch.zeros_like(reference), torch.zeros_like(reference))
+    return Placed.still(body, origin, quat_to_matrix(torch.as_tensor(quat).to(world.gravity)))

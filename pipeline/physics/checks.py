@@ -167,12 +167,9 @@ class Overlap:
 def overlaps(world: World, state: State) -> Iterator[Overlap]:
     """Yield the overlap of each pair of bodies that can touch, and of bodies with the ground and with surfaces."""
     rotations = quat_to_matrix(state.quat_wxyz)
-    zero = torch.zeros_like(state.position_m[:, 0])
-    placed = []
-    for index, body in enumerate(world.bodies):
-        position, rotation = state.position_m[:, index], rotations[:, index]
-        com = (rotation @ body.com[..., None]).squeeze(-1) if body.free else torch.zeros_like(position)
-        placed.append(Placed(body=body, reference=position + com, rotation=rotation, velocity=zero, omega=zero))
+    placed = [
+        Placed.still(body, state.position_m[:, index], rotations[:, index]) for index, body in enumerate(world.bodies)
+    ]
     for a, b in pairs_of(world):
         surface = world.surface(b)
         if surface is not None:

@@ -47,6 +47,13 @@ class Placed:
     omega: Tensor
     """Angular velocity [rad/s], shape (n, 3)."""
 
+    @staticmethod
+    def still(body: Body, origin: Tensor, rotation: Tensor) -> Placed:
+        """Return a body at rest with its frame at origins (n, 3) [m] and rotations (n, 3, 3)."""
+        reference = origin + (rotation @ body.com[..., None]).squeeze(-1) if body.free else origin
+        zero = torch.zeros_like(origin)
+        return Placed(body=body, reference=reference, rotation=rotation, velocity=zero, omega=zero)
+
     @property
     def origin(self) -> Tensor:
         """The reference point in the body frame [m], shape (1 or n, 3)."""

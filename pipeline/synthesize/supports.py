@@ -82,17 +82,16 @@ class Supports:
     def overlaps(self, places: Array, arms: Array, radii: Array) -> NDArray[np.bool_]:
         """Return whether spheres overlap any surface, by place of their body's origin (P, 3) [m]; shape (P,)."""
         tensors = (torch.as_tensor(np.asarray(x), dtype=torch.float64) for x in (places, arms[None], radii[None]))
-        reference, centers, sizes = tensors
-        zero = torch.zeros_like(reference)
-        still = torch.eye(3, dtype=torch.float64).expand(len(reference), 3, 3)
+        origin, centers, sizes = tensors
+        upright = torch.eye(3, dtype=torch.float64).expand(len(origin), 3, 3)
         one = torch.ones(1, dtype=torch.float64)
         body = Body(
             name="shape", motion="fixed", mass=one, inertia=torch.eye(3, dtype=torch.float64)[None],
-            com=zero[:1], centers=centers, radii=sizes,
+            com=torch.zeros(1, 3, dtype=torch.float64), centers=centers, radii=sizes,
         )  # fmt: skip
-        placed = Placed(body, reference, still, zero, zero)
+        placed = Placed.still(body, origin, upright)
         inside = [surface_depth(placed, surface) > 0 for surface in self.surfaces]
-        return torch.stack(inside).any(0).numpy() if inside else np.zeros(len(reference), bool)
+        return torch.stack(inside).any(0).numpy() if inside else np.zeros(len(origin), bool)
 
     def _span(self, place: Array, height: float) -> float:
         """Return how far from a height along `up` surfaces reach [m]."""

@@ -68,10 +68,8 @@ def _gap_to_fixed(other: Body, centers: Tensor, radii: Tensor) -> Tensor:
 
 def _gap_to_surfaces(world: World, body: Body, origin: Tensor, rotation: Tensor) -> Tensor:
     """Return the smallest gap (B, T) [m] of a body at origins (B, T, 3) to the fixed surfaces, as `surface_gap`."""
-    turned = rotation.flatten(0, 1)
-    place = origin.flatten(0, 1) + turned @ body.com[0]
-    still = torch.zeros_like(place)
-    found = [surface_gap(Placed(body, place, turned, still, still), surface) for surface in world.surfaces]
+    placed = Placed.still(body, origin.flatten(0, 1), rotation.flatten(0, 1))
+    found = [surface_gap(placed, surface) for surface in world.surfaces]
     return torch.stack(found).amin(0).view(origin.shape[:2])
 
 

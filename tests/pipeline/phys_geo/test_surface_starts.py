@@ -3,14 +3,14 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.phys_geo.surface_starts import require_outside
-from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics import Body, World
 from cgwm.pipeline.physics.chain import Chain, Joint
 from cgwm.pipeline.physics.contact_detection import Placed
 from cgwm.pipeline.physics.fixed_surface import KINDS, FixedSurface
@@ -61,3 +61,14 @@ def test_a_link_on_a_surface_does_not_fly() -> None:
     turns, still = torch.eye(3, dtype=torch.float64).expand(5, 3, 3), torch.zeros(5, 3, dtype=torch.float64)
     gap = surface_gap(Placed(body, places, turns, still, still), world.surfaces[0])
     np.testing.assert_allclose(gap, [np.inf, 0.03, 0.0, -0.01, np.inf], atol=1e-12)
+
+
+@pytest.mark.parametrize("motion", ["free", "link"])
+def test_a_body_at_rest_has_its_spheres_where_its_frame_is(motion: Literal["free", "link"]) -> None:
+    body = Body(
+        name="one", motion=motion, mass=torch.ones(1), inertia=torch.eye(3)[None],
+        com=torch.tensor([[0.1, -0.2, 0.3]]), centers=torch.tensor([[[0.5, 0.0, 0.0]]]), radii=torch.ones(1, 1),
+    )  # fmt: skip
+    turn = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    placed = Placed.still(body, torch.tensor([[1.0, 2.0, 3.0]]), turn)
+    assert torch.allclose(placed.reference[:, None] + placed.arms(), torch.tensor([[[1.0, 2.5, 3.0]]]))
