@@ -199,6 +199,12 @@ class SegmentsThresholds:
         "report10: six tosses of the own engine's list without an effect of contact",
         "with two parameters 2 of 69 were named, both a friction by direction of a box",
     )
+    fitted_parameters: int = threshold(
+        2,
+        "parameters",
+        "an effect with more is not fitted in segments, so that they do not name it",
+        "by argument: a few sizes do not cover the nine numbers of a friction map",
+    )
     first_score: float = threshold(
         0.0,
         "chi2",

@@ -12,17 +12,12 @@ from torch import Tensor
 from ..physics.effects.effect import ActiveEffect
 from ..segments.force_fields import FlownMotion, ForceField
 from .own_tilt import OWN_TILTS
+from .thresholds import THRESHOLDS
+
+LIMITS = THRESHOLDS.forms
 
 UPWARD = ("gravity_scale", "length_scale", "clock_scale")
 """Effects that change the fall, and nothing across it."""
-USUAL_FLIGHT = 0.75
-"""Quantile of the episodes' flights of which times are shares."""
-SHARES = (0.15, 0.3, 0.45, 0.6)
-"""Shares of a usual flight at which a force sets in or ends."""
-POWERS = (-1, 1, 2)
-"""Powers of speed and spin, in their medians, that a force is multiplied by."""
-SLOW = {"speed": 0.05, "spin": 0.3}
-"""Speed [m/s] and spin [rad/s] below which their powers are those there: the direction of rest is unknown."""
 OTHER_DRAG = {("linear_drag", 1): "quadratic_drag", ("quadratic_drag", -1): "linear_drag"}
 """Powers of the speed that make one drag of the library another one."""
 
@@ -62,11 +57,11 @@ def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) ->
 def _when(motion: FlownMotion) -> Mapping[str, Tensor]:
     """Return factors of a force that sets in or ends, or does both."""
     since, left = motion.spans_s
-    usual, found = float(np.quantile((since + left)[:, 0].numpy(), USUAL_FLIGHT)), {}
-    for share in SHARES:
+    usual, found = float(np.quantile((since + left)[:, 0].numpy(), LIMITS.usual_flight)), {}
+    for share in LIMITS.shares:
         on = (since > share * usual).double()
         found |= {f"from {share * usual:.2g} s of a flight on": on, f"until {share * usual:.2g} s of a flight": 1 - on}
-    for first, last in itertools.combinations(SHARES, 2):
+    for first, last in itertools.combinations(LIMITS.shares, 2):
         on = ((since > first * usual) & (since <= last * usual)).double()
         found[f"from {first * usual:.2g} to {last * usual:.2g} s of a flight"] = on
     return found
@@ -82,9 +77,9 @@ def _where(motion: FlownMotion, name: str, values: Tensor) -> Mapping[str, Tenso
 
 def _how_fast(motion: FlownMotion, name: str, vectors: Tensor, named: tuple[str, ...] = ()) -> Mapping[str, Tensor]:
     """Return factors of a force by other powers of speed or spin; none where it has no spread."""
-    size = vectors.norm(dim=-1).clamp_min(SLOW[name])
+    size = vectors.norm(dim=-1).clamp_min(LIMITS.slowest[name == "spin"])
     size = size / motion.median(size)
     if not bool((size[motion.inside] - 1).abs().max() > 1e-6):
         return {}
     known = {power for (drag, power), other in OTHER_DRAG.items() if drag in named[:1] and other in named}
-    return {f"times the {name} to the power {power}": size**power for power in POWERS if power not in known}
+    return {f"times the {name} to the power {power}": size**power for power in LIMITS.powers if power not in known}

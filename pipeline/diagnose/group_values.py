@@ -35,11 +35,6 @@ LIMITS = THRESHOLDS.flight
 
 Array = NDArray[np.float64]
 
-MOST_PARAMETERS = 3
-"""Most parameters of an effect: more are a body's, which is the same in all groups."""
-REFITTED = 5
-"""How many effects, no two of which do the same, are refitted in each place: a step from neutral ranks them badly."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class _Fitted:
@@ -222,7 +217,7 @@ def _fits(search: _Search, place: _Place) -> list[_Fitted]:
     scored = [one for variant in variants if (one := _scored(search, linear, variant)) is not None]
     scored.sort(key=lambda one: (-one.gain, one.variant.place))
     found = []
-    for one, twins in _unlike(linear, scored)[:REFITTED]:
+    for one, twins in _unlike(linear, scored)[: LIMITS.own_shortlist]:
         fitted = _fitted(search, place, kept[one.variant.place], one.values)
         found.append(replace(fitted, twins=tuple((kept[twin.variant.place], twin.values) for twin in twins)))
     return found
@@ -288,7 +283,7 @@ def _unlike(linear: Linearization, scored: Sequence[_Scored]) -> list[tuple[_Sco
 def _suits(candidate: Candidate) -> bool:
     """Return whether an effect can have a value in each group."""
     effect = candidate.effect
-    few = 0 < len(effect.parameters) <= MOST_PARAMETERS
+    few = 0 < len(effect.parameters) <= LIMITS.own_parameters
     return few and not effect.constants and "drag" not in effect.needs and effect.phase != "contact"
 
 

@@ -27,8 +27,6 @@ CONSTANT = ("gravity_tilt", "frame_tilt", "constant_force", "gravity_scale", "bu
 """Effects whose acceleration in flight is constant: scales of lengths and clock change what gravity seems to be."""
 SCALES = ("length_scale", "clock_scale")
 """Those of them that act on what is measured."""
-USUAL_FLIGHT = 0.75
-"""Quantile of the flights' lengths over which the force fades or grows: shorter flights show less of it."""
 
 
 def without_lasting(flight: Segments, world: World, names: Sequence[str], dispersion: float) -> set[str]:
@@ -87,7 +85,7 @@ def _fading_and_growing(flight: Segments, name: str) -> Tensor:
         begun[item.episode] = min(float(first), begun.get(item.episode, float(first)))
     starts = [begun[item.episode] for item in flight.items]
     since = times - torch.tensor(starts).to(times)[:, None]
-    share = (since / float(np.quantile(lengths, USUAL_FLIGHT))).clamp(0.0, 1.0)[..., None, None]
+    share = (since / float(np.quantile(lengths, THRESHOLDS.forms.usual_flight))).clamp(0.0, 1.0)[..., None, None]
     acceleration = _acceleration(flight, name, lengths)
     step = times.diff(dim=1)[..., None, None]
     paths = []

@@ -29,9 +29,6 @@ LIMITS = THRESHOLDS.verdict
 
 Array = NDArray[np.float64]
 
-TOLD = 0.05
-"""Information of an episode in that of a usual tilt from which it counts among those that tell their scatter."""
-
 
 def common_tilt_p(flight: Segments, world: World, groups: Sequence[int], dispersion: float) -> float:
     """Return the p-value of a tilt that all episodes have beside such of each episode's own.
@@ -51,7 +48,7 @@ def common_tilt_p(flight: Segments, world: World, groups: Sequence[int], dispers
         information = linear.information[mine][:, columns][:, :, columns].sum(0) / dispersion
         shrunk = np.linalg.inv(np.eye(2) + own * information)
         score = linear.score[mine][:, columns].sum(0) / dispersion
-        told = int((np.linalg.eigvalsh(information) * own > TOLD).sum())
+        told = int((np.linalg.eigvalsh(information) * own > LIMITS.levelled_told).sum())
         parts.append((information @ shrunk, shrunk.T @ score, told))
     common = _explained(np.sum([matrix for matrix, *_ in parts], 0), np.sum([slope for _, slope, _ in parts], 0))
     q = max(sum(_explained(matrix, slope) for matrix, slope, _ in parts) - common, 0.0)

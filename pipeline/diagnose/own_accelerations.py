@@ -23,8 +23,6 @@ LIMITS = THRESHOLDS.verdict
 Array = NDArray[np.float64]
 
 QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
-FEWEST = 4
-"""Minimum number of episodes: fewer leave less than two degrees of freedom beside a law."""
 
 
 UPWARD = "upward"
@@ -91,7 +89,7 @@ class OwnAccelerations:
     def law(self) -> str | None:
         """Return what the episodes' accelerations follow beyond chance; None where nothing is found."""
         values = self.by_episode()
-        if len(values) < FEWEST:
+        if len(values) < LIMITS.law_episodes:
             return None
         if self._is_upward(values):
             return UPWARD

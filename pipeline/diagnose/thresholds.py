@@ -87,6 +87,18 @@ class FlightThresholds:
         BY_ARGUMENT,
         "the largest class that flights cannot tell apart has five; one of 149 nulls of real-like development had nine",
     )
+    own_parameters: int = threshold(
+        3,
+        "parameters",
+        "an effect with more has no value in each group: it is a body's, which is the same in all groups",
+        BY_ARGUMENT,
+    )
+    own_shortlist: int = threshold(
+        5,
+        "effects",
+        "how many effects with a value in each group, no two of which do the same, are refitted in each place",
+        "by argument: as `shortlist`; a step from neutral ranks them badly",
+    )
     most_effects: int = threshold(3, "effects", "how many effects are looked for in flight")
     share: float = threshold(
         0.6,
@@ -223,6 +235,12 @@ class VerdictThresholds:
         "forces that last had 0.03 or more",
         "a gust that fills the flights (0.15 of 0.37 s) passes: early and late differ by less than their errors",
     )
+    law_episodes: int = threshold(
+        4,
+        "episodes",
+        "fewest whose own accelerations are tested for a law that they follow",
+        "by argument: three leave two degrees of freedom beside a law",
+    )
     own_episodes: int = threshold(
         8,
         "episodes",
@@ -245,6 +263,13 @@ class VerdictThresholds:
         "by argument: a spirit level shows 0.5 to 1 mm/m, boards and grounds are worse",
         "real-like development: none of 4 forces in no library stays that was named a tilt, and of 4 tilts the one is "
         "lost that moves the body by 8 slow errors",
+    )
+    levelled_told: float = threshold(
+        0.05,
+        "1",
+        "information of an episode in that of a usual tilt (`levelled_rad`) from which it counts as a degree of "
+        "freedom of the episodes' scatter",
+        "by argument: a tilt with an error above 4.5 usual ones says nothing of how these scatter",
     )
     usual_scale: float = threshold(
         3e-3,
@@ -319,6 +344,41 @@ class VerdictThresholds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FormThresholds:
+    """A named force is compared with other forms of it."""
+
+    usual_flight: float = threshold(
+        0.75,
+        "quantile",
+        "of the lengths of the flights: the usual flight, of which times are shares, and over which a constant force "
+        "fades or grows (`verdict.lasting_ratio`)",
+        "by argument: shorter flights show less of a late force",
+    )
+    shares: tuple[float, ...] = threshold(
+        (0.15, 0.3, 0.45, 0.6),
+        "usual flights",
+        "when a force sets in or ends: a name that these forms imitate is withheld by `verdict.form_odds`",
+        "0.3 to 0.6 by argument, in the middle of flights; 0.15 after a capture of real-like report8 (gravity that "
+        "sets in) was looked at again",
+        "with the other forms: see `verdict.form_odds`",
+    )
+    powers: tuple[int, ...] = threshold(
+        (-1, 1, 2),
+        "1",
+        "powers of speed and spin, in their medians, that the force of another form is multiplied by",
+        "by argument: they make a force that is linear in speed one that does not grow with it, a quadratic or a cubic "
+        "one",
+        "with the other forms: see `verdict.form_odds`",
+    )
+    slowest: tuple[float, float] = threshold(
+        (0.05, 0.3),
+        "m/s, rad/s",
+        "speed and spin below which their powers are those there",
+        "by argument: the direction of what rests is unknown",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class ExperimentThresholds:
     """Detection limits, the next experiment and the residual law."""
 
@@ -378,6 +438,8 @@ class Thresholds:
     """Forward selection in flight."""
     verdict: VerdictThresholds = field(default_factory=VerdictThresholds)
     """What remains unexplained."""
+    forms: FormThresholds = field(default_factory=FormThresholds)
+    """Other forms of a named force."""
     sliding: SlidingThresholds = field(default_factory=SlidingThresholds)
     """Sliding test."""
     impact: ImpactThresholds = field(default_factory=ImpactThresholds)

@@ -46,9 +46,6 @@ from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, 
 
 Array = NDArray[np.float64]
 
-MOST_FITTED = 2
-"""Maximum number of parameters of an effect that is fitted; a friction map has nine."""
-
 
 @dataclass(frozen=True)
 class SegmentsTest(ContactTest):
@@ -127,7 +124,7 @@ def _first_of_slides(data: ContactData) -> Evidence | None:
 def _can_be_fitted(one: Evidence) -> bool:
     """Return whether a candidate is fitted: one of contact whose number of parameters a few sizes cover."""
     effect = one.candidate.effect
-    return effect.phase == "contact" and len(effect.parameters) <= MOST_FITTED
+    return effect.phase == "contact" and len(effect.parameters) <= THRESHOLDS.segments.fitted_parameters
 
 
 def _acts_near_ground(variant: Variant) -> bool:
