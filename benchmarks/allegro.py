@@ -128,7 +128,9 @@ def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
     return task
 
 
-def measure(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> dict[str, Any]:
+def measure(
+    folder: Path, scene: Path, seed: int, given: argparse.Namespace, piped: PipedPlant | None
+) -> dict[str, Any]:
     """Return the figures of one run."""
     task = task_of(folder, scene, seed, given)
     # some starts overlap with the thumb, and the wanted place with the fingers at the start: a task may ask neither
@@ -138,11 +140,10 @@ def measure(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
     goal = task.goal.model_copy(update={"position_m": PLACES[scene.stem.removeprefix("env_allegro_")][1]})
     controller.task = task.model_copy(update={"goal": goal})
     controller.hand = replace(controller.hand, task=controller.task)
-    plant = PipedPlant(controller.hand, given.mujoco) if given.mujoco else HandScenePlant(controller.hand)
+    if piped is not None:
+        piped.open(controller.hand)
     with no_garbage_search():
-        found = run_hand(controller, plant, seed, "ideal")
-    if isinstance(plant, PipedPlant):
-        plant.close()
+        found = run_hand(controller, piped or HandScenePlant(controller.hand), seed, "ideal")
     cpu = 1e3 * found.column("cpu_s", "plans")
     return {
         "ended": found.ended,
@@ -200,6 +201,7 @@ def main() -> None:
             print(" | ".join(row))
         return
     torch.set_num_threads(len(os.sched_getaffinity(0)))
+    piped = PipedPlant(given.mujoco) if given.mujoco else None
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for thing in given.objects.split(","):
@@ -209,7 +211,9 @@ def main() -> None:
                 size += f", {given.plant}" if given.plant else ""
                 size += f", {given.draws} draws" if given.draws else ""
                 size += f", {given.mujoco.name}" if given.mujoco else ""
-                store.result(f"{thing}, {size}/{seed}", lambda c=scene, s=seed: measure(folder, c, s, given))
+                store.result(f"{thing}, {size}/{seed}", lambda c=scene, s=seed: measure(folder, c, s, given, piped))
+    if piped is not None:
+        piped.close()
 
 
 if __name__ == "__main__":

@@ -22,22 +22,23 @@ from cgwm.schemas import NotConvergedError
 
 
 class PipedPlant:
-    """A `HandScenePlant` in a process of its own.
+    """A `HandScenePlant` in a process of its own, which may serve one task after the other.
 
     Args:
-        hand: The task.
         folder: Folder of packages that come before the installed ones.
     """
 
-    def __init__(self, hand: HandWorld, folder: Path) -> None:
+    def __init__(self, folder: Path) -> None:
         path = os.pathsep.join(part for part in (str(folder.resolve()), os.environ.get("PYTHONPATH", "")) if part)
         self._process = subprocess.Popen(
             [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "MUJOCO_GL": "disable"},
         )  # fmt: skip
+
+    def open(self, hand: HandWorld) -> str:
+        """Take another task, and return the version of MuJoCo in the process."""
         task = hand.task
-        self.mujoco: str = self._asked((task, task._source, hand.joints, hand.home))
-        """Version of MuJoCo in the process."""
+        return self._asked(("open", task, task._source, hand.joints, hand.home))
 
     def reset(self, position_m: Array, quat_wxyz: Array) -> HandTruth:
         """See `cgwm.pipeline.control.hand_plant.HandPlant`."""
@@ -66,22 +67,25 @@ class PipedPlant:
 def main() -> None:
     """Answer until the pipe is closed."""
     answers, sys.stdout = sys.stdout.buffer, sys.stderr  # what libraries print must not enter the pipe
-    task, source, joints, home = pickle.load(sys.stdin.buffer)
-    task._source = source
-    hand: Any = SimpleNamespace(task=task, joints=joints, home=home)
-    plant = HandScenePlant(hand)
-    answer: Any = importlib.import_module("mujoco").__version__
+    plant = None
     while True:
-        pickle.dump(answer, answers)
-        answers.flush()
         try:
             name, *arguments = pickle.load(sys.stdin.buffer)
         except EOFError:
             return
-        try:
-            answer = getattr(plant, name)(*arguments)
-        except NotConvergedError as error:
-            answer = error
+        answer: Any
+        if name == "open":
+            task, source, joints, home = arguments
+            task._source = source
+            hand: Any = SimpleNamespace(task=task, joints=joints, home=home)
+            plant, answer = HandScenePlant(hand), importlib.import_module("mujoco").__version__
+        else:
+            try:
+                answer = getattr(plant, name)(*arguments)
+            except NotConvergedError as error:
+                answer = error
+        pickle.dump(answer, answers)
+        answers.flush()
 
 
 if __name__ == "__main__":

@@ -24,12 +24,18 @@ finally:
 def test_a_plant_behind_a_pipe_has_the_states_of_one_in_this_process(tmp_path: Path) -> None:
     write_hand(tmp_path)
     hand: Any = SimpleNamespace(task=hand_task(tmp_path), joints=JOINTS, home=np.zeros(2))
-    here, there = HandScenePlant(hand), PipedPlant(hand, tmp_path)  # no other packages: the same MuJoCo
+    here, there = HandScenePlant(hand), PipedPlant(tmp_path)  # no other packages: the same MuJoCo
     start = np.array(hand.task.start.position_m), np.array([1.0, 0.0, 0.0, 0.0])
-    states = [[plant.reset(*start), *(plant.advance(np.array([0.5, 0.1]), 0.05) for _ in range(6))]
-              for plant in (here, there)]  # fmt: skip
+
+    def states_of(plant: Any) -> list[Any]:
+        return [plant.reset(*start), *(plant.advance(np.array([0.5, 0.1]), 0.05) for _ in range(6))]
+
+    states = [states_of(here)]
+    for _ in range(2):  # another task in the same process
+        there.open(hand)
+        states.append(states_of(there))
     there.close()
-    for one, other in zip(*states, strict=True):
+    for one, other in [*zip(states[0], states[1], strict=True), *zip(states[0], states[2], strict=True)]:
         for name, value in vars(one).items():
             np.testing.assert_array_equal(value, getattr(other, name))
     assert np.linalg.norm(states[0][-1].position_m - states[0][0].position_m) > 1e-3  # the paddle moved it
