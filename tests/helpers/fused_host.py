@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import platform
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -180,6 +181,9 @@ static void simulate(Problem& problem) {
 #endif
 }
 
+// Bytes of what the threads of an environment share.
+extern "C" unsigned long shared_size() { return sizeof(Environment); }
+
 static sigjmp_buf before_faults;
 static void fault(int) { siglongjmp(before_faults, 1); }
 
@@ -240,8 +244,32 @@ def library(structure: Structure, flags: tuple[str, ...] = ("-O0",)) -> ctypes.C
     return kernel_build.built(recipe, ".so", build, lambda file: ctypes.CDLL(str(file)))
 
 
+SIZES = {"signed char": 1, "short": 2, "int": 4}
+"""Bytes of the types of which lists are."""
+SHARED_ROOM = 0.3
+"""Largest share by which the bound on an environment's memory may exceed what it takes."""
+
+
+@cache
+def check_memory(structure: Structure) -> None:
+    """Compare the bounds on the memory that threads share, from which follows how many of them fit, with what it is."""
+    if not structure.shared:
+        return
+    size = library(structure).shared_size
+    size.restype = ctypes.c_ulong
+    copies = re.findall(r"__shared__ static ([a-z ]+) \w+\[(\d+)\];", structure.source())
+    lists = sum(SIZES[kind] * int(count) for kind, count in copies)
+    environments = 32 // structure.lanes
+    room = structure.shared_bytes - size()
+    assert copies and 0 <= room <= SHARED_ROOM * size(), f"{room} bytes more than an environment takes"
+    # each list may begin up to 3 bytes after the one before, and the block's last array elsewhere
+    more = structure.block_bytes - environments * structure.shared_bytes - lists
+    assert 3 * len(copies) <= more <= 3 * len(copies) + 64, f"{more} bytes more than lists of a block take"
+
+
 def run(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
     """Do what `fused.launch.launch` does, on the CPU."""
     pointers = [ctypes.c_void_p(None if tensor is None else tensor.data_ptr()) for tensor in tensors]
     faulty = library(structure).run(*pointers, *(ctypes.c_int(number) for number in numbers))
+    check_memory(structure)
     assert not faulty, "the kernel used an index that was not set or lies outside of an array"

@@ -10,14 +10,21 @@ import torch
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.phys_geo.tracks.contact_fit import RestitutionFit, damping_of, restitution_of
 from cgwm.pipeline.physics.contact_law import restitution
-from cgwm.pipeline.segments.bounces import BounceSide, _turns
+from cgwm.pipeline.segments.bounces import Bounce, BounceSide, _turns, bounces_of
 from cgwm.pipeline.segments.impact_law import changes_rebound
 from cgwm.pipeline.segments.restitution_fit import (
     CONTACT_PRIOR,
     DRAG_PRIOR,
+    LIFT_MEAN,
+    LIMITS,
+    NOISE_PRIOR,
+    SCATTER_PRIOR,
+    SHAKEN_MEAN,
     SHAKEN_S,
     _Flight,
     _Flights,
+    _flights,
+    _found_noise,
     _ground,
     _Noise,
     _Solved,
@@ -26,6 +33,8 @@ from cgwm.pipeline.segments.restitution_fit import (
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from helpers.diagnosis_data import world_with
 from helpers.worlds import ball_body, world_of
+from scipy.stats import expon, norm
+from scipy.stats import t as student_t
 
 RADIUS_M, GRAVITY_M_S2, STEP_S = 0.02, 9.81, 1e-3
 
@@ -205,3 +214,132 @@ def test_an_error_that_both_speeds_share_is_none_of_their_ratio() -> None:
     assert found.own.tolist() == [0.8, 0.6] and found.own_std[0] < 1e-6
     assert found.own_std[1] == pytest.approx(0.6 * 0.2 * 2**0.5)
     assert found.estimate > 0.75
+
+
+def four_bounces() -> tuple[list[Bounce], _Noise]:
+    """Bounces of a ball with slow errors, and some noise."""
+    rng = np.random.default_rng(3)
+    world = world_of(ball_body(RADIUS_M))
+    tracks = [bounce(rng, 143.0, 0.8, 0.13, 3e-4) for _ in range(4)]
+    whole = whole_episodes(world, [Episode(str(k), {"ball": track}) for k, track in enumerate(tracks)])
+    return bounces_of(world, whole), _Noise(white_m=2e-4, slow_m=4e-4, time_s=0.02, lift_m_s2=0.3, shaken_m=2e-4)
+
+
+def test_speeds_at_the_ground_and_their_covariance_follow_from_states_drag_and_ground() -> None:
+    """First-order propagation, by differences of v = sqrt(u^2 + 2 g (h0 - ground)) with states that drag changes."""
+    bounces, noise = four_bounces()
+    found, solved = (
+        _Speeds.of(bounces, GRAVITY_M_S2, noise),
+        _Solved.of(_Flights.of(_flights(bounces, GRAVITY_M_S2)), noise),
+    )
+    drag, variance = solved.drag
+    states = (solved.states - drag * solved.slopes).reshape(-1, 2, 2)
+    ground, contact_s, ground_var = _ground(states, solved.covariance.reshape(-1, 2, 2, 2))
+
+    def speeds(own: np.ndarray, k: float, at: float) -> np.ndarray:
+        moved = solved.states + own - k * solved.slopes
+        return np.sqrt(moved[:, 1] ** 2 + 2 * GRAVITY_M_S2 * (moved[:, 0] - at))
+
+    nothing, step = np.zeros_like(solved.states), 1e-6
+    np.testing.assert_allclose(found.speeds.ravel(), speeds(nothing, drag, ground), rtol=1e-12)
+
+    def slope(axis: int | None, k: float = 0.0, at: float = 0.0) -> np.ndarray:
+        own = nothing if axis is None else nothing + np.eye(2)[axis]
+        ends = [speeds(s * step * own, drag + s * step * k, ground + s * step * at) for s in (1, -1)]
+        return (ends[0] - ends[1]) / (2 * step)
+
+    by_state = np.stack([slope(0), slope(1)], -1)
+    wanted = np.diag(np.einsum("ni,nij,nj->n", by_state, solved.covariance, by_state))
+    wanted += variance * np.outer(slope(None, k=1.0), slope(None, k=1.0))
+    wanted += ground_var * np.outer(slope(None, at=1.0), slope(None, at=1.0))
+    np.testing.assert_allclose(found.covariance, wanted, rtol=1e-5, atol=1e-6 * wanted.max())
+    # frames of a contact are those from the time at which one flight is on the ground to that of the other
+    assert found.drag == drag and len(found.contacts) == len(bounces)
+    for (begin, end), (before, after) in zip(found.contacts, states, strict=True):
+        fallen, risen = (np.roots([-0.5 * GRAVITY_M_S2, up, height - ground]) for height, up in (before, after))
+        assert begin + LIMITS.apart_s == pytest.approx(fallen.max())
+        assert end - LIMITS.apart_s == pytest.approx(max(risen.min(), fallen.max() + contact_s))
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_the_noise_of_flights_is_where_likelihood_and_priors_are_highest(count: int) -> None:
+    """Log-normal priors of white and slow noise and its time, exponential ones of what lifts and shakes."""
+    bounces, _ = four_bounces()
+    flights = _flights(bounces[:count], GRAVITY_M_S2)
+    found = _found_noise(flights)
+    names = ("white_m", "slow_m", "time_s", "lift_m_s2", "shaken_m")
+    batch_of_flights = _Flights.of(flights)
+
+    def cost(noise: _Noise) -> float:
+        prior = sum(
+            norm.logpdf(np.log(getattr(noise, n)), np.log(m), w)
+            for n, (m, w) in zip(names[:3], NOISE_PRIOR, strict=True)
+        )
+        for name, mean in (("lift_m_s2", LIFT_MEAN), ("shaken_m", SHAKEN_MEAN)):
+            prior += expon.logpdf(getattr(noise, name), scale=mean) + np.log(getattr(noise, name))
+        return _Solved.of(batch_of_flights, noise).cost - 2 * float(prior)
+
+    best = cost(found)
+    for name in names:
+        for factor in (np.exp(-0.4), np.exp(0.4)):
+            assert cost(replace(found, **{name: factor * getattr(found, name)})) > best - 0.15
+
+
+def test_a_restitution_does_not_depend_on_the_unit_of_speed_and_is_told_better_by_more_impacts() -> None:
+    rng = np.random.default_rng(0)
+    fall = rng.uniform(1.5, 3.0, 6)
+    speeds = np.stack([fall, 0.8 * fall], -1)
+    own = rng.normal(size=(12, 12))
+    cover = 1e-4 * (own @ own.T / 12 + np.eye(12))
+    noise = _Noise(white_m=1e-3, slow_m=1e-3, time_s=0.05, lift_m_s2=0.1, shaken_m=1e-3)
+
+    def found(scale: float = 1.0, degrees: int = 40, chosen: int = 6) -> RestitutionFit:
+        n = 2 * chosen
+        some = _Speeds(speeds=scale * speeds[:chosen], covariance=scale**2 * cover[:n, :n], contacts=[], drag=0.1)
+        return some.restitution(noise, degrees)
+
+    one, other = found(), found(3.0)
+    assert one.estimate == pytest.approx(0.8) and other.estimate == pytest.approx(one.estimate)
+    assert other.std_error == pytest.approx(one.std_error) and other.scatter == pytest.approx(one.scatter)
+    assert 0 < one.scatter < 2 * SCATTER_PRIOR and one.std_error < found(chosen=2).std_error
+    # Student's quantile for the degrees of freedom that the noise was found with, at least two
+    wider = float(student_t.ppf(0.975, 2) / student_t.ppf(0.975, 40))
+    assert found(degrees=0).std_error == pytest.approx(wider * one.std_error, rel=1e-6)
+    assert found(degrees=10**7).std_error < one.std_error
+    slope = np.zeros((6, 12))
+    for k in range(6):
+        slope[k, 2 * k], slope[k, 2 * k + 1] = -0.8 / fall[k], 1 / fall[k]
+    np.testing.assert_allclose(one.own_std, np.sqrt(np.diag(slope @ cover @ slope.T)))
+    assert one.drag_per_m == 0.1 and one.lift_m_s2 == noise.lift_m_s2 and one.noise_m == (1e-3, 1e-3, 0.05)
+    scattered = _Speeds(
+        speeds=np.stack([fall, [0.5, 0.9, 0.6, 0.95, 0.7, 0.85] * fall], -1), covariance=cover, contacts=[], drag=0.0
+    )
+    assert scattered.restitution(noise, 40).scatter > 0.08 > 3 * one.scatter
+
+
+def test_the_scatter_of_impacts_is_its_mean_over_what_it_may_be() -> None:
+    """Restricted likelihood of values with a common mean, an exponential prior, integrated on a fine grid."""
+    rng = np.random.default_rng(5)
+    count, fall = 7, rng.uniform(1.5, 3.0, 7)
+    own = 0.8 + 0.02 * rng.normal(size=count)
+    std = np.geomspace(0.003, 0.04, count)  # of each restitution, by errors of the speed after it
+    covariance = np.zeros((2 * count, 2 * count))
+    covariance[1::2, 1::2] = np.diag((std * fall) ** 2) + 0.01**2 * np.outer(fall, fall)
+    measured = _Speeds(speeds=np.stack([fall, own * fall], -1), covariance=covariance, contacts=[], drag=0.0)
+    noise = _Noise(white_m=1e-3, slow_m=1e-3, time_s=0.05, lift_m_s2=0.1, shaken_m=1e-3)
+    found = measured.restitution(noise, 10**6)
+    grid, ones = np.linspace(0, 0.3, 601), np.ones((count, 1))
+    weight, means, variances = np.zeros_like(grid), np.zeros_like(grid), np.zeros_like(grid)
+    for k, scatter in enumerate(grid):
+        cover = np.diag(std**2) + 0.01**2 + scatter**2 * np.eye(count)
+        inverse = np.linalg.inv(cover)
+        variances[k] = 1 / (ones.T @ inverse @ ones).item()
+        means[k] = variances[k] * (ones.T @ inverse @ own).item()
+        left = own - means[k]
+        likelihood = np.sqrt(variances[k] / np.linalg.det(cover)) * np.exp(-0.5 * left @ inverse @ left)
+        weight[k] = likelihood * expon.pdf(scatter, scale=SCATTER_PRIOR)
+    weight /= weight.sum()
+    mean = weight @ means
+    assert found.scatter == pytest.approx(weight @ grid, rel=0.03)
+    assert found.estimate == pytest.approx(mean, abs=2e-4)
+    assert found.std_error == pytest.approx(np.sqrt(weight @ (variances + (means - mean) ** 2)), rel=0.01)
