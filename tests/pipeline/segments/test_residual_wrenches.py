@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,28 +11,37 @@ import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.optimization.tails import chi2_tail
+from cgwm.pipeline.segments import contact_phases as contact_phases_module
+from cgwm.pipeline.segments import residual_wrench
 from cgwm.pipeline.segments.carried_starts import LIMITS as CARRIED
 from cgwm.pipeline.segments.carried_starts import Beginning, Step, _shape, _spread, _step
 from cgwm.pipeline.segments.contact_phases import LIMITS as PHASES
-from cgwm.pipeline.segments.contact_phases import _round_share, _surface_speeds, contact_phases, is_round
+from cgwm.pipeline.segments.contact_phases import _round_share, _surface_speeds, contact_phases, is_round, phases_of
 from cgwm.pipeline.segments.flight_contrasts import FRAMES, _spread_frames, moving
 from cgwm.pipeline.segments.input_checks import LIMITS as INPUT
 from cgwm.pipeline.segments.input_checks import _apart, _on_a_tilted_plane, _travel, _turns
 from cgwm.pipeline.segments.residual_wrench import (
     BINS,
+    COORDINATES,
     TERMS,
     WEAK_STD,
     ResidualWrenches,
     _bins,
+    coordinates_of,
     covariates_of,
     dispersion,
     motion_axes,
     omnibus,
+    sound_windows,
     unit_acceleration,
+    wrench_windows,
 )
 from cgwm.pipeline.segments.slow_errors import _level_axes
-from cgwm.pipeline.trajectories.segmentation import size_of
+from cgwm.pipeline.segments.thresholds import SEGMENT_THRESHOLDS
+from cgwm.pipeline.trajectories.segmentation import Segment, size_of
+from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.worlds import F64, ball_body, box_body, world_of
+from scipy.spatial.transform import Rotation
 
 
 def wrenches(wrench: np.ndarray, episode: np.ndarray, seed: int = 0) -> ResidualWrenches:
@@ -305,3 +316,115 @@ def test_level_axes_are_those_across_gravity() -> None:
     world = world_of(ball_body())
     assert _level_axes(world) == [0, 1]
     assert _level_axes(world_of(ball_body(), gravity=0.0)) == [0, 1, 2]
+
+
+def test_windows_overlap_by_half_and_fill_each_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(residual_wrench, "Segments", SimpleNamespace(of=lambda *given: given))
+    monkeypatch.setattr(residual_wrench, "fit_states", lambda given: given)
+    monkeypatch.setattr(residual_wrench, "residual_wrenches", lambda given: given)
+    for rate, length in ((200.0, 28), (41.0, 6)):  # frames of 0.14 s, six at least
+        times = (torch.arange(200, dtype=F64) / rate).expand(3, -1)
+        whole: Any = SimpleNamespace(times_s=times)
+        flights = [Segment(0, 5, 150), Segment(2, 0, length - 1), Segment(1, 7, 5 + length)]
+        given: Any = wrench_windows(world_of(ball_body()), whole, flights, Noise(1e-3, 1e-2))
+        assert given[0] == "flight" and given[2] is whole
+        windows = given[3]
+        assert all(one.last - one.first + 1 == length for one in windows)
+        firsts = [one.first for one in windows if one.episode == 0]
+        assert firsts[0] == 5 and set(np.diff(firsts)) == {length // 2}
+        assert 150 - length // 2 < firsts[-1] + length - 1 <= 150
+        assert [one for one in windows if one.episode == 2] == [flights[1]]
+        assert not any(one.episode == 1 for one in windows)  # one frame too short
+    assert wrench_windows(world_of(ball_body()), whole, flights[2:], Noise(1e-3, 1e-2)) is None
+
+
+def test_coordinates_are_those_of_the_middle_of_each_window() -> None:
+    rng = np.random.default_rng(0)
+    count, frames = 3, 9
+    position, velocity = (torch.as_tensor(rng.normal(size=(count, frames, 2, 3))) for _ in range(2))
+    omega, quat = (
+        torch.as_tensor(rng.normal(size=(count, frames, 2, 3))),
+        torch.as_tensor(rng.normal(size=(count, frames, 2, 4))),
+    )
+    quat = quat / quat.norm(dim=-1, keepdim=True)
+    motion = SimpleNamespace(position_m=position, velocity_m_s=velocity, omega_body_rad_s=omega, quat_wxyz=quat)
+    normal = torch.tensor([0.6, 0.0, 0.8], dtype=F64)
+    tilted = replace(
+        world_of(box_body(), ball_body()), ground_normal=normal, ground_offset=torch.tensor([0.25], dtype=F64)
+    )
+    times = torch.as_tensor(np.sort(rng.uniform(0, 3, (count, frames))))
+    for world, up, offset in ((tilted, normal.numpy(), 0.25), (world_of(ball_body(), ground=False), np.eye(3)[2], 0.0)):
+        segments: Any = SimpleNamespace(
+            rollout=lambda: motion,
+            observations=SimpleNamespace(free=(1,), times_s=times),
+            items=[SimpleNamespace(episode=k) for k in (4, 0, 4)],
+            lengths=[9, 6, 3],
+            world=world,
+        )
+        found, speeds, spins = coordinates_of(segments)
+        assert tuple(found) == COORDINATES
+        for k, middle in enumerate((4, 3, 1)):
+            place, moving = position[k, middle, 1].numpy(), velocity[k, middle, 1].numpy()
+            turn = Rotation.from_quat(quat[k, middle, 1].numpy(), scalar_first=True)
+            np.testing.assert_allclose(speeds[k], moving)
+            np.testing.assert_allclose(spins[k], turn.apply(omega[k, middle, 1].numpy()))
+            wanted = [float(times[k, middle]), *place[:2], place @ up - offset, math.atan2(moving[1], moving[0])]
+            wanted += [np.linalg.norm(moving), float(omega[k, middle, 1].norm()), (4.0, 0.0, 4.0)[k]]
+            np.testing.assert_allclose([found[name][k] for name in COORDINATES], wanted, err_msg=str(k))
+
+
+def test_loud_windows_are_left_out_unless_half_of_all_would_be() -> None:
+    count = 8
+    found = wrenches(np.zeros((count, 6)), np.arange(count))
+    taken = np.einsum("nij,nji->n", found.information, found.covariance)
+
+    def kept(sizes: list[float], dof: float = 24.0) -> int:
+        """Windows with chi2 per degree of freedom of these sizes."""
+        rows = torch.zeros(count, 5, 6, dtype=F64)
+        rows[:, 0, 0] = torch.as_tensor(np.sqrt(np.array(sizes) * (dof - taken)))
+        segments: Any = SimpleNamespace(
+            residuals=lambda *_, jacobian: (rows, jacobian),
+            world=SimpleNamespace(gravity=torch.zeros(1, 3, dtype=F64)),
+            dof=torch.full((count,), dof, dtype=F64),
+            select=list,
+        )
+        some, left = sound_windows(segments, found)
+        assert len(left.segments) == (count if some is segments else len(some))
+        return len(left.segments)
+
+    most = SEGMENT_THRESHOLDS.slow_errors.unsound
+    assert kept([1.0] * 7 + [1.01 * most]) == 7 and kept([1.0] * 7 + [0.99 * most]) == 8
+    assert kept([0.3] * 7 + [1.01 * most]) == 7 and kept([0.3] * 7 + [0.99 * most]) == 8  # noise itself is one
+    assert kept([2.0] * 7 + [1.5 * most]) == 8  # beside the quietest quarter
+    assert kept([1.0] * 4 + [9 * most] * 4) == 4 and kept([1.0] * 3 + [9 * most] * 5) == 8
+    assert kept([1.0] * 7 + [9 * most], dof=float(taken.max()) + 0.5) == 8  # nothing tells the noise
+
+
+def test_a_ball_is_round_where_its_spheres_are_about_its_middle() -> None:
+    ball = ball_body(0.04, copies=2)
+    near, far = ball.centers.clone(), ball.centers.clone()
+    near[0, 1], far[0, 1] = 0.9 * 0.04e-3 / 3**0.5, 1.1 * 0.04e-3 / 3**0.5  # in all three coordinates
+    assert is_round(replace(ball, centers=near)) and not is_round(replace(ball, centers=far))
+    assert not is_round(replace(ball, centers=0.5 * (ball.centers + 0.04)))
+    many = ball_body(0.04, copies=50)
+    assert is_round(replace(many, centers=many.centers + 0.3e-3 * 0.04))
+
+
+def test_phases_are_those_of_measured_frames_up_to_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = torch.ones(3, 8, 2, dtype=F64)
+    seen[0, 6:], seen[1, 2] = 0, 0
+    seen[2, :, 0], seen[2, 7] = 0, 0  # of one body only
+    airborne = torch.zeros(3, 8, dtype=torch.bool)
+    airborne[0, :3], airborne[1, 4] = True, True
+    whole: Any = SimpleNamespace(seen=seen, times_s=torch.arange(8, dtype=F64).expand(3, -1) / 100)
+    contact: Any = SimpleNamespace(items=[Segment(0, 2, 4), Segment(1, 3, 5)])
+    monkeypatch.setattr(
+        contact_phases_module, "contact_phases", lambda _: [["impact", "sliding", "rest"], ["rolling"] * 3]
+    )
+    found = phases_of(["a", "b", "c"], whole, airborne, contact)
+    assert [one.episode for one in found] == ["a", "b", "c"] and [len(one.phase) for one in found] == [6, 8, 7]
+    assert found[0].phase.tolist() == ["flight"] * 3 + ["sliding", "rest", "flight"]  # what flies touches nothing
+    assert found[1].phase.tolist() == ["flight"] * 3 + ["rolling", "flight", "rolling", "flight", "flight"]
+    assert all((one.airborne == airborne[k, : len(one.phase)].numpy()).all() for k, one in enumerate(found))
+    assert found[2].time_s.tolist() == pytest.approx([0.01 * k for k in range(7)])
+    assert [set(one.phase) for one in phases_of(["a", "b", "c"], whole, airborne, None)] == [{"flight"}] * 3

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.segments import slow_errors
-from cgwm.pipeline.segments.slow_errors import FINER, LEAST_COUNT, LIMITS, SHORTEST, SPACING, THINNED, tell_errors
+from cgwm.pipeline.segments.slow_errors import (
+    FINER,
+    FLIGHTS,
+    LEAST_COUNT,
+    LIMITS,
+    SHORTEST,
+    SPACING,
+    THINNED,
+    SlowErrors,
+    tell_errors,
+)
 from cgwm.pipeline.segments.variance_components import FAST_S, FASTEST_S
 from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, NoiseModel
 from cgwm.pipeline.trajectories.segmentation import Segment
@@ -57,28 +67,34 @@ def test_a_flight_counts_unless_it_is_far_louder_than_the_quiet_ones(size: float
     # without the loud one two episodes are left, which are too few
     few = flights(seen, seen, [0, 0, 0, 1, 2, 2])
     assert LIMITS.least_episodes == 3 and slow_errors._sound_flights(few, rows, jacobian) == [0, 1, 2, 3, 4, 5]
+    seen[1:3, 1:], seen[5, 1:] = 0, 0  # two flights of which the variance is told are too few to compare
+    assert slow_errors._sound_flights(flights(seen, seen), rows, jacobian) == [0, 1, 2, 3, 4, 5]
 
 
 def thinned(
-    monkeypatch: pytest.MonkeyPatch, known: CorrelatedNoise, found_s: list[float], counts: list[float | None]
+    monkeypatch: pytest.MonkeyPatch,
+    known: CorrelatedNoise,
+    found_s: list[float],
+    counts: list[float | None],
+    level: tuple[int, ...] = (0, 1),
 ) -> tuple[list[float], Any]:
     """Return the times between frames that were tried where estimates give times, and numbers of contrasts."""
     tried, times = [], iter(found_s)
 
     def contrasts(*arguments: Any) -> Any:
         tried.append(arguments[5])
-        assert arguments[3:5] == (7, 0) and arguments[6] == (0, 1)
+        assert arguments[3:5] == (7, 0) and arguments[6] == (level or (0, 1, 2))
         count = counts[min(len(tried), len(counts)) - 1]
         return None if count is None else SimpleNamespace(count=count)
 
-    def components(one: Any, given: Any, level: Any) -> Any:
-        assert one.count >= LIMITS.least_frames and given is known and level == (0, 1)
+    def components(one: Any, given: Any, axes: Any) -> Any:
+        assert one.count >= LIMITS.least_frames and given is known and axes == level
         time_s = next(times)
         return (time_s, CorrelatedNoise(size=1.0, share=0.5, time_s=time_s), 0.0, 0.0)
 
     monkeypatch.setattr(slow_errors, "FlightContrasts", SimpleNamespace(of=contrasts))
     monkeypatch.setattr(slow_errors, "variance_components", components)
-    found = slow_errors._parts(SimpleNamespace(), (torch.zeros(1), torch.zeros(1)), 7, 0, known, (0, 1))  # pyright: ignore[reportArgumentType]
+    found = slow_errors._parts(SimpleNamespace(), (torch.zeros(1), torch.zeros(1)), 7, 0, known, level)  # pyright: ignore[reportArgumentType]
     return tried, found
 
 
@@ -86,6 +102,7 @@ def test_frames_are_thinned_out_again_while_the_errors_turn_out_to_be_faster(mon
     enough: list[float | None] = [float(LIMITS.least_frames)]
     white, slow = CorrelatedNoise(), CorrelatedNoise(size=1.0, share=0.5, time_s=0.04)
     assert thinned(monkeypatch, white, [0.1], enough)[0] == [0.0]
+    assert thinned(monkeypatch, white, [0.1], enough, ())[0] == [0.0]  # errors of rotations are alike in all axes
     first = SPACING * 0.04
     assert first < SPACING * FAST_S
     assert thinned(monkeypatch, slow, [0.04], enough)[0] == pytest.approx([first])
@@ -104,6 +121,8 @@ def test_flights_that_show_too_little_are_thinned_out_less(monkeypatch: pytest.M
     few = float(LIMITS.least_frames - 1)
     tried, _ = thinned(monkeypatch, slow, [0.04], [few, None, few + 1])
     assert tried == pytest.approx([0.02, 0.01, 0.005])
+    tried, found = thinned(monkeypatch, slow, [0.01], [few + 1, *[None] * 20])
+    assert found[0] == 0.01 and tried[1] == pytest.approx(0.25 * tried[0]) and tried[-1] == 0.0  # the first stays
     tried, found = thinned(monkeypatch, slow, [], [None])
     assert found is None and tried[-1] == 0.0
     steps = tried[:-1]
@@ -140,11 +159,11 @@ def test_components_below_the_floor_of_tracks_are_none(monkeypatch: pytest.Monke
         segments=lambda *_: None, observations=SimpleNamespace(), noise=noise, noise_model=known
     )
     asked: dict[int, Any] = {}
-    sizes = {0: 1.0, 1: 1.0}
+    sizes, slow = {0: 1.0, 1: 1.0}, {0: 0.2, 1: 0.2}
 
     def parts(flown: Any, linear: Any, count: int, kind: int, given: Any, level: tuple[int, ...]) -> Any:
         asked[kind] = (flown, linear, count, given, level)
-        big = CorrelatedNoise(size=sizes[kind], slow=0.2 * sizes[kind], slow_time_s=0.3)
+        big = CorrelatedNoise(size=sizes[kind], slow=slow[kind], slow_time_s=0.3)
         return big, CorrelatedNoise(size=sizes[kind]), 3.0 + kind, 9.0 - kind
 
     rows, width = torch.arange(3.0, dtype=F64)[:, None, None].expand(3, 2, 6), 0.25
@@ -172,6 +191,47 @@ def test_components_below_the_floor_of_tracks_are_none(monkeypatch: pytest.Monke
     assert found.noise_model.rotation.size == 0.26
     sizes[1] = 0.24
     found, wrong = slow_errors._of_flights(prepared, world, [], items)
-    assert found is not None and found.noise_model == known and found.evidence == 0.0  # one flight counts for nothing
+    assert (
+        found is not None and found.noise_model == known and found.evidence == found.sway_evidence == 0.0
+    )  # one flight counts for nothing
+    slow[0] = 0.51
+    found, _ = slow_errors._of_flights(prepared, world, [], items)
+    assert found is not None and found.noise_model.position.slow == 0.51
+    slow[0] = 0.2
     monkeypatch.setattr(slow_errors, "_sound_flights", lambda *_: [0, 1, 2])
     assert slow_errors._of_flights(prepared, world, [], items) == (None, [])
+
+
+def test_errors_are_told_from_flights_evenly_spread_over_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    items = [Segment(k, 0, 2 * SHORTEST) for k in range(3 * FLIGHTS)]
+    short = [Segment(k, 0, SHORTEST - 2) for k in range(3)]
+    prepared: Any = SimpleNamespace(flight=SimpleNamespace(items=tuple(items)))
+    chosen: list[Segment] = []
+    wrong = [items[5]]
+
+    def of_flights(_: Any, world: Any, variants: Any, some: list[Segment]) -> Any:
+        chosen[:] = some
+        return found, wrong
+
+    monkeypatch.setattr(slow_errors, "whole_flights", list)
+    monkeypatch.setattr(slow_errors, "_of_flights", of_flights)
+    model = NoiseModel(CorrelatedNoise(slow=0.3))
+    found: SlowErrors | None = SlowErrors(model, NoiseModel(), 1.0, 2.0, ())
+    result = slow_errors.flight_errors(prepared, world_of(ball_body()), [])
+    assert result is not None and result.flights == tuple(one for one in items if one not in wrong)
+    episodes = [one.episode for one in chosen]
+    assert len(chosen) == FLIGHTS and episodes[0] == 0 and episodes[-1] == 3 * FLIGHTS - 1
+    assert set(np.diff(episodes)) == {3, 4}
+    assert slow_errors.slow_errors(prepared, world_of(ball_body()), []) == result
+    found = SlowErrors(NoiseModel(), NoiseModel(), 0.0, 0.0, ())  # errors that are not slow
+    assert slow_errors.slow_errors(prepared, world_of(ball_body()), []) is None
+    assert slow_errors.flight_errors(prepared, world_of(ball_body()), []) is not None
+    prepared.flight.items = (*items[: LIMITS.least_episodes], *short)
+    slow_errors.flight_errors(prepared, world_of(ball_body()), [])
+    assert chosen == items[: LIMITS.least_episodes]
+    prepared.flight.items = (*items[: LIMITS.least_episodes - 1], *short)
+    assert slow_errors.flight_errors(prepared, world_of(ball_body()), []) is None
+    prepared.flight.items, found = tuple(items), None
+    assert slow_errors.flight_errors(prepared, world_of(ball_body()), []) is None
+    prepared.flight = None
+    assert slow_errors.flight_errors(prepared, world_of(ball_body()), []) is None
