@@ -36,7 +36,8 @@ def compared(arguments, size=SIZE, channels=3, min_alpha=1 / 255, distortion=Non
             outputs = (seen.features, seen.alpha, seen.depth * seen.alpha, seen.median_depth)
         else:
             single = None if distortion is None else distortion.float()
-            outputs = rasterize(*leaves, Ks.float(), Raster(*size, min_alpha, 0.0), single)[:4]
+            *outputs, pairs = rasterize(*leaves, Ks.float(), Raster(*size, min_alpha, 0.0), single)
+            assert not outputs[3].requires_grad and not pairs.requires_grad
         gradients = []
         if not by_camera:
             parts = torch.cat([outputs[0], *(o[..., None] for o in outputs[1:3])], -1)

@@ -10,6 +10,7 @@ import torch
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_to_matrix
 from cgwm.pipeline.physics.impulse_solver import tangent_axes
 from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.segments.candidates import base_values
 from cgwm.pipeline.segments.impact_fit import (
     BASE,
     FRICTION_SHARE,
@@ -21,6 +22,7 @@ from cgwm.pipeline.segments.impact_fit import (
     fit_impacts,
     fits_to_weighted,
 )
+from cgwm.pipeline.segments.impact_law import after_impact, contact_law, point_velocity, rebound_speed
 from cgwm.pipeline.segments.impact_velocities import Impacts
 from helpers.worlds import F64, ball_body, batch, world_of
 
@@ -174,3 +176,30 @@ def test_a_base_is_weighed_at_its_own_fit_and_begins_at_usual_values() -> None:
     np.testing.assert_allclose(base.fit.values, second.values)
     with pytest.raises(ValueError, match="no weights"):
         ImpactProblem(world, BASE, seen).rows(usual()[None])
+
+
+def test_an_impact_that_follows_the_law_leaves_nothing() -> None:
+    """A ball about its middle, of any inertia: twists after impacts are those that the law gives from those before."""
+    world, seen = tilted_world(), impacts()
+    body = replace(world.bodies[0], com=torch.zeros(1, 3, dtype=F64))
+    world = replace(world, bodies=(body,))
+    problem = ImpactProblem(world, BASE, seen)
+    one = problem._impact(world, seen.before)
+    rebound = rebound_speed(one, contact_law(world), ())
+    closing = point_velocity(seen.before, one.arm) @ one.normal
+    pushed = replace(one, impulse=body.mass * (rebound - closing))
+    after = after_impact(pushed, contact_law(world), ())
+    torch.testing.assert_close(point_velocity(after, one.arm) @ one.normal, rebound)
+    known = base_values(world, BASE)[None]
+    left = problem.residuals(known, after=after)[0]
+    torch.testing.assert_close(left, torch.zeros_like(left), rtol=0, atol=1e-9)
+    along = tangent_axes(one.normal)[1:]
+    turned = after + torch.tensor([0.0, 0.0, 0.0, 0.3, -0.2, 0.7], dtype=F64)
+    left = problem.residuals(known, after=turned)[0]
+    torch.testing.assert_close(left[:, 3:], RADIUS_M * (turned - after)[:, 3:])
+    aside = after + torch.cat([0.03 * along[0] - 0.02 * along[1], torch.zeros(3, dtype=F64)])
+    left = problem.residuals(known, after=aside)[0]
+    torch.testing.assert_close(left[:, 1:3], torch.tensor([[0.03, -0.02]], dtype=F64).expand(len(seen), 2))
+    assert float(left[:, [0, 3, 4, 5]].abs().max()) < 1e-9
+    higher = after + torch.cat([0.05 * one.normal, torch.zeros(3, dtype=F64)])
+    assert problem.residuals(known, after=higher)[0][:, 0].tolist() == pytest.approx([0.05] * len(seen))
