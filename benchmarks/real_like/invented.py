@@ -204,8 +204,110 @@ def swinging_torque(thing: Thing, size: float, rng: np.random.Generator) -> Hidd
     )
 
 
+@hidden_effect("fast_drag", "unknown", 0.02, 0.08)
+def fast_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """A drag -m k |v| v that acts above a speed of 0.6 to 1.1 m/s or of 2.1 to 2.5 m/s alone, k [1/m]."""
+    least = rng.uniform(0.6, 1.1) if rng.uniform() < 0.5 else rng.uniform(2.1, 2.5)
+
+    def acceleration(now: Moment) -> Array:
+        speed = float(np.linalg.norm(now.velocity_m_s))
+        return -size * speed * now.velocity_m_s if speed > least else _NONE
+
+    return _pushed("fast_drag", {"k": size, "least_m_s": least}, "force -m k |v| v above a speed", acceleration)
+
+
+@hidden_effect("slow_drag", "unknown", 0.2, 0.8)
+def slow_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """A drag -m c v that acts below a speed of 1.3 to 2.5 m/s alone, c [1/s]."""
+    most = rng.uniform(1.3, 2.5)
+    return _pushed(
+        "slow_drag",
+        {"c": size, "most_m_s": most},
+        "force -m c v below a speed",
+        lambda now: -size * now.velocity_m_s if np.linalg.norm(now.velocity_m_s) < most else _NONE,
+    )
+
+
+@hidden_effect("fast_spin_damping", "unknown", 0.5, 2.0)
+def fast_spin_damping(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """A spin damping that acts above 3 to 8 rad/s alone, d [1/s]."""
+    least = rng.uniform(3.0, 8.0)
+    return _turned(
+        "fast_spin_damping",
+        {"d": size, "least_rad_s": least},
+        "torque -d I omega above a spin",
+        lambda now: -size * now.omega_rad_s if np.linalg.norm(now.omega_rad_s) > least else _NONE,
+    )
+
+
+@hidden_effect("swinging_weight", "unknown", 1.0, 3.0)
+def swinging_weight(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """A vertical force that oscillates at 1.8 to 2.8 Hz, amplitude [m/s2]."""
+    frequency, phase = rng.uniform(1.8, 2.8), rng.uniform(0, 2 * np.pi)
+    return _pushed(
+        "swinging_weight",
+        {"f": size, "frequency_hz": frequency, "phase_rad": phase},
+        "force m f sin(2 pi frequency t + phase) upwards",
+        lambda now: size * np.sin(2 * np.pi * frequency * now.time_s + phase) * _UP,
+    )
+
+
+@hidden_effect("twisting", "unknown", 10.0, 30.0)
+def twisting(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """A torque about an axis of the world that oscillates at 2 to 2.8 Hz or at 5.5 to 7 Hz, amplitude [rad/s2]."""
+    axis, slow = direction(rng), rng.uniform() < 0.5
+    frequency, phase = rng.uniform(2.0, 2.8) if slow else rng.uniform(5.5, 7.0), rng.uniform(0, 2 * np.pi)
+    return _turned(
+        "twisting",
+        {"f": size, "frequency_hz": frequency, "phase_rad": phase},
+        "torque I f sin(2 pi frequency t + phase)",
+        lambda now: size * np.sin(2 * np.pi * frequency * now.time_s + phase) * axis,
+    )
+
+
+@hidden_effect("thrust", "unknown", 0.6, 2.0)
+def thrust(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """A force m f along an axis of the body, f [m/s2]."""
+    axis = direction(rng)
+    return _pushed("thrust", {"f": size}, "force m f along an axis of the body", lambda now: size * now.rotation @ axis)
+
+
+@hidden_effect("one_way_drag", "unknown", 0.2, 0.8)
+def one_way_drag(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """A drag along one level axis of the world alone, c [1/s]."""
+    along = horizontal(rng)
+    return _pushed(
+        "one_way_drag",
+        {"c": size},
+        "force -m c (n v) n, n level",
+        lambda now: -size * (now.velocity_m_s @ along) * along,
+    )
+
+
+@hidden_effect("height_spring", "unknown", 2.0, 8.0)
+def height_spring(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """A vertical spring of stiffness [1/s2] towards a height of 0.3 to 0.5 m."""
+    height = rng.uniform(0.3, 0.5)
+    return _pushed(
+        "height_spring",
+        {"stiffness": size, "height_m": height},
+        "force m stiffness (height - z) upwards",
+        lambda now: size * (height - now.com_m[2]) * _UP,
+    )
+
+
+@hidden_effect("precession", "unknown", 0.5, 2.0)
+def precession(thing: Thing, size: float, rng: np.random.Generator) -> Hidden:
+    """A torque across the spin and the vertical, g [1/s]."""
+    return _turned("precession", {"g": size}, "torque I g z x omega", lambda now: size * np.cross(_UP, now.omega_rad_s))
+
+
 DEVELOPMENT = ("side_step", "late_spin_damping", "height_force", "cubic_drag", "dry_drag", "quadratic_lift", "swirl")
 DEVELOPMENT += ("fading", "updraft", "dry_spin_drag")
 """Laws that development captures have."""
+BOUNDED = ("fast_drag", "slow_drag", "fast_spin_damping", "swinging_weight", "twisting")
+"""Further ones, that act on one side of a speed or swing: kinds of law that the tenth report had first."""
 UNSEEN = ("jet", "low_updraft", "ramp", "drag_crisis", "yaw_brake", "swinging_torque")
 """Laws that reports have from report9 on, and no development capture."""
+STRANGE = ("thrust", "one_way_drag", "height_spring", "precession")
+"""Laws that reports have beside these from report11 on: no kind of these was known to any rule."""

@@ -26,6 +26,7 @@ Stage = Literal[
     "report8",
     "report9",
     "report10",
+    "report11",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on `development` alone. Each report stage is read once, after everything is fixed: the first
@@ -50,6 +51,7 @@ _CENTROIDS = {"linear_drag", "quadratic_drag", "wind", "constant_force", "gravit
 _CENTROIDS |= {"length_scale", "clock_scale", "gust", "shaking", "attractor", "heading_force", "gravity_step"}
 _CENTROIDS |= {"side_step", "fading", "height_force", "swirl", "cubic_drag", "dry_drag", "updraft"}
 _CENTROIDS |= {"jet", "low_updraft", "ramp", "drag_crisis"}
+_CENTROIDS |= {"fast_drag", "slow_drag", "swinging_weight", "one_way_drag", "height_spring"}
 """Effects that show without orientations; balls with these, or none, have centroids only in 3 of 10 captures."""
 
 
@@ -124,7 +126,8 @@ def real_cases(stage: Stage, nulls: int = NULLS, each: int = EACH, more: int = 0
     found = [_case(stage, "null", groups[k % len(groups)], k) for groups in engines.values() for k in range(nulls)]
     groups = list(GROUPS)
     found += [_case(stage, row, groups[k % len(groups)], k) for row in ROWS[1:] for k in range(each)]
-    return found + [_invented(stage, groups[k % len(groups)], k) for k in range(more)]
+    lists = [kind for kind in _INVENTED if _laws(stage, kind)]
+    return found + [_invented(stage, groups[k % len(groups)], k, kind) for kind in lists for k in range(more)]
 
 
 def _case(stage: Stage, row: Row, group: str, k: int) -> RealCase:
@@ -145,14 +148,26 @@ def _case(stage: Stage, row: Row, group: str, k: int) -> RealCase:
     return RealCase(name=name, group=group, thing=thing, effects=effects, row=row, seed=seed)
 
 
-def _invented(stage: Stage, group: str, k: int) -> RealCase:
-    """Return a case whose law is one of `invented`: those of development, or those that it lacks."""
-    stem = f"real-like/{stage}/invented/{group}/{k}"
+_INVENTED = ("invented", "bounded")
+"""Lists of the laws of `invented`, of which a stage has those that it has laws of."""
+
+
+def _laws(stage: Stage, kind: str) -> tuple[str, ...]:
+    """Return the laws of a list that a stage hides: those of development, or those that it lacks."""
+    if stage == "development":
+        return invented.DEVELOPMENT if kind == "invented" else invented.BOUNDED
+    if kind != "invented":
+        return ()
+    return invented.UNSEEN if STAGES.index(stage) < STAGES.index("report11") else invented.UNSEEN + invented.STRANGE
+
+
+def _invented(stage: Stage, group: str, k: int, kind: str) -> RealCase:
+    """Return a case whose law is one of a list of `invented`."""
+    stem = f"real-like/{stage}/{kind}/{group}/{k}"
     seed = 2 * (crc32(stem.encode()) // 2) + (stage != "development")
     rng = np.random.default_rng([seed, *b"plan"])
     thing: Kind = ("cube", "ball")[int(rng.integers(2))]
-    laws = invented.DEVELOPMENT if stage == "development" else invented.UNSEEN
-    law = str(rng.choice(laws))
+    law = str(rng.choice(_laws(stage, kind)))
     return RealCase(name=f"{stem}/{thing}/{law}", group=group, thing=thing, effects=(law,), row="unknown", seed=seed)
 
 

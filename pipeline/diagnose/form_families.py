@@ -1,8 +1,13 @@
-"""Families of forms that a named force is compared with: when, where, how fast and how spinning a body feels it."""
+"""Families of forms that a named force is compared with: when, where, how fast and how spinning a body feels it.
+
+A force may also swing: at so many periods in a usual flight, in one of four phases. A torque that swings does so about
+an axis of the world, since none that a body has of its own is known to any effect.
+"""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -51,19 +56,40 @@ def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) ->
     families = [_when(motion), _where(motion, "height", place["height"]), level]
     families += [_how_fast(motion, "speed", motion.velocity_m_s, named), _how_fast(motion, "spin", motion.omega_rad_s)]
     found = [{f"{same} {words}": own.times(factor) for words, factor in family.items()} for family in families]
-    return [family for family in found if family]
+    return [family for family in (*found, _swinging(motion, own)) if family]
+
+
+def _usual_flight_s(lengths_s: Tensor) -> float:
+    """Return the duration of a usual flight [s] from those of all (B, 1)."""
+    return float(np.quantile(lengths_s[:, 0].numpy(), LIMITS.usual_flight))
 
 
 def _when(motion: FlownMotion) -> Mapping[str, Tensor]:
     """Return factors of a force that sets in or ends, or does both."""
     since, left = motion.spans_s
-    usual, found = float(np.quantile((since + left)[:, 0].numpy(), LIMITS.usual_flight)), {}
+    usual, found = _usual_flight_s(since + left), {}
     for share in LIMITS.shares:
         on = (since > share * usual).double()
         found |= {f"from {share * usual:.2g} s of a flight on": on, f"until {share * usual:.2g} s of a flight": 1 - on}
     for first, last in itertools.combinations(LIMITS.shares, 2):
         on = ((since > first * usual) & (since <= last * usual)).double()
         found[f"from {first * usual:.2g} to {last * usual:.2g} s of a flight"] = on
+    return found
+
+
+def _swinging(motion: FlownMotion, own: ForceField) -> Family:
+    """Return a force that swings along its own direction, or a torque that does so about an axis of the world."""
+    since, left = motion.spans_s
+    usual, torque = _usual_flight_s(since + left), bool(own.turning.any())
+    if torque:
+        axes = torch.eye(3, dtype=torch.float64).expand(*since.shape, 3, 3)
+        own = ForceField(torch.zeros_like(axes), axes)
+    words = "a torque about one axis of the world" if torque else "the same force"
+    found = {}
+    for periods, phase in itertools.product(LIMITS.periods, LIMITS.phases):
+        swing = torch.sin(math.pi * (2 * periods * since / usual + phase))
+        at = f" in phase {180 * phase:.0f} deg" if phase else ""
+        found[f"{words}, swinging at {periods / usual:.2g} Hz{at}"] = own.times(swing)
     return found
 
 
@@ -76,10 +102,16 @@ def _where(motion: FlownMotion, name: str, values: Tensor) -> Mapping[str, Tenso
 
 
 def _how_fast(motion: FlownMotion, name: str, vectors: Tensor, named: tuple[str, ...] = ()) -> Mapping[str, Tensor]:
-    """Return factors of a force by other powers of speed or spin; none where it has no spread."""
-    size = vectors.norm(dim=-1).clamp_min(LIMITS.slowest[name == "spin"])
+    """Return factors of a force by other powers of speed or spin, or on one side of it; none where it has no spread."""
+    plain = vectors.norm(dim=-1)
+    size = plain.clamp_min(LIMITS.slowest[name == "spin"])
     size = size / motion.median(size)
     if not bool((size[motion.inside] - 1).abs().max() > 1e-6):
         return {}
     known = {power for (drag, power), other in OTHER_DRAG.items() if drag in named[:1] and other in named}
-    return {f"times the {name} to the power {power}": size**power for power in LIMITS.powers if power not in known}
+    found = {f"times the {name} to the power {power}": size**power for power in LIMITS.powers if power not in known}
+    for edge in torch.quantile(plain[motion.inside], torch.tensor(LIMITS.edges, dtype=plain.dtype)).tolist():
+        on = (plain > edge).double()
+        words = f"{edge:.2g} {'m/s' if name == 'speed' else 'rad/s'} alone"
+        found |= {f"where the {name} is above {words}": on, f"where the {name} is below {words}": 1 - on}
+    return found

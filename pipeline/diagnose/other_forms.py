@@ -3,8 +3,10 @@
 A name is right only if the force has the law of that name. A gust, a force that sets in late, one that acts on one side
 of the room, or a damping by another power of the spin is followed by the nearest effect of the library, too, and few
 flights need not show what is left. The force that is named is therefore compared with other forms of it: the same one
-during a part of the flights, above a height, on one side of a place, by another power of speed or spin. Each takes its
-place in flights linearised at their fit, with the states and the other effects fitted again, and has as many numbers.
+during a part of the flights, above a height, on one side of a place, by another power of speed or spin, above or below
+one of these alone, or swinging in time. Each takes its place in flights linearised at their fit, with the states and
+the other effects fitted again, and has as many numbers; a torque that swings has those of its axis, which cost what
+they do in BIC.
 
 Before the data, no form of a family is likelier than another, no family likelier than another, and all together are as
 likely as the law that is named; the odds are those of the mean likelihoods. No model of errors is exact, and how the
@@ -148,13 +150,14 @@ Tried = list[list[list[tuple[FormCost, int]]]]
 
 def _tried(fit: FormFit, form: Sequence[int], dispersion: float) -> Tried:
     """Return the costs of a form as it is, with one more effect of the library, and without one that is named."""
-    found: Tried = [[[(fit.in_its_stead(form, dispersion), 0)]]]
+    more = len(form) - len(fit.forms[0])
+    found: Tried = [[[(fit.in_its_stead(form, dispersion), more)]]]
     if fit.more:
         found.append(
-            [[(fit.in_its_stead(form, dispersion, one), len(one)) for one in variants] for variants in fit.more]
+            [[(fit.in_its_stead(form, dispersion, one), more + len(one)) for one in variants] for variants in fit.more]
         )
     if fit.others:
-        found.append([[(fit.in_its_stead(form, dispersion, (), one), -len(one))] for one in fit.others])
+        found.append([[(fit.in_its_stead(form, dispersion, (), one), more - len(one))] for one in fit.others])
     return found
 
 

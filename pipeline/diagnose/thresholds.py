@@ -376,6 +376,27 @@ class FormThresholds:
         "speed and spin below which their powers are those there",
         "by argument: the direction of what rests is unknown",
     )
+    edges: tuple[float, ...] = threshold(
+        (0.2, 0.4, 0.6, 0.8),
+        "quantiles",
+        "of the speeds, or the spins, of all frames of flight: where the force of another form begins or ends to act",
+        "by argument: a fifth of the frames show what acts on them",
+        "with the other forms: see `verdict.form_odds`",
+    )
+    periods: tuple[float, ...] = threshold(
+        (1.0, 1.5, 2.0, 3.0),
+        "1 / usual flight",
+        "how often the force of another form swings in a usual flight",
+        "by argument: less than one period is a force that grows or fades, and more than three move a body little",
+        "with the other forms: see `verdict.form_odds`",
+    )
+    phases: tuple[float, ...] = threshold(
+        (0.0, 0.25, 0.5, 0.75),
+        "half turns",
+        "phases at the begin of a flight in which it does",
+        "by argument: half a turn more is the other sign, and an eighth of a turn leaves 15 % of chi2",
+        "with the other forms: see `verdict.form_odds`",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

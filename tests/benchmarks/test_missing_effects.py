@@ -10,7 +10,7 @@ from cgwm.datasets.synthetic.hidden_effects import EFFECTS
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 from real_like.errors import Errors, draw_errors, noise
-from real_like.invented import DEVELOPMENT, UNSEEN
+from real_like.invented import BOUNDED, DEVELOPMENT, STRANGE, UNSEEN
 from real_like.plan import STAGES, real_cases
 from real_like.score import judge, wilson
 
@@ -87,9 +87,10 @@ def test_seeds_of_development_and_reports_are_apart_and_do_not_depend_on_the_num
 
 
 def test_reports_hide_laws_that_no_development_capture_has() -> None:
-    laws = {stage: {case.effects[0] for case in real_cases(stage, 0, 0, 60)} for stage in ("development", "report9")}
-    assert laws["development"] == set(DEVELOPMENT) and laws["report9"] == set(UNSEEN)
-    assert not laws["development"] & laws["report9"]
+    stages = ("development", "report9", "report11")
+    laws = {stage: {case.effects[0] for case in real_cases(stage, 0, 0, 60)} for stage in stages}
+    assert laws["development"] == {*DEVELOPMENT, *BOUNDED} and laws["report9"] == set(UNSEEN)
+    assert laws["report11"] == {*UNSEEN, *STRANGE} and not laws["development"] & laws["report11"]
     assert all(
         case.row == "unknown" and EFFECTS[case.effects[0]].acts == "unknown" for case in real_cases("report9", 0, 0, 9)
     )
