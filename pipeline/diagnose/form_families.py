@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +27,14 @@ UPWARD = ("gravity_scale", "length_scale", "clock_scale")
 OTHER_DRAG = {("linear_drag", 1): "quadratic_drag", ("quadratic_drag", -1): "linear_drag"}
 """Powers of the speed that make one drag of the library another one."""
 
-Family = dict[str, ForceField]
+
+class Family(NamedTuple):
+    """Forms of a force that differ in one coordinate."""
+
+    forms: dict[str, ForceField]
+    """Each by a description in words."""
+    then: str
+    """What to record next to tell them apart."""
 
 
 def own_field(motion: FlownMotion, active: ActiveEffect) -> ForceField | None:
@@ -43,7 +51,7 @@ def own_field(motion: FlownMotion, active: ActiveEffect) -> ForceField | None:
 
 
 def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) -> list[Family]:
-    """Return the forms of a force, each by a description in words, in families of one coordinate.
+    """Return the forms of a force, in families of one coordinate.
 
     Args:
         motion: The flights.
@@ -53,10 +61,18 @@ def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) ->
     same = "the same torque" if bool(own.turning.any()) else "the same force"
     place = dict(zip(("x", "y", "height"), motion.com_m.unbind(-1), strict=True))
     level = {**_where(motion, "x", place["x"]), **_where(motion, "y", place["y"])}
-    families = [_when(motion), _where(motion, "height", place["height"]), level]
-    families += [_how_fast(motion, "speed", motion.velocity_m_s, named), _how_fast(motion, "spin", motion.omega_rad_s)]
-    found = [{f"{same} {words}": own.times(factor) for words, factor in family.items()} for family in families]
-    return [family for family in (*found, _swinging(motion, own)) if family]
+    factors = {
+        "record shorter and longer flights": _when(motion),
+        "record lower and higher flights": _where(motion, "height", place["height"]),
+        "record flights elsewhere": level,
+        "record slower and faster flights": _how_fast(motion, "speed", motion.velocity_m_s, named),
+        "record flights with less and with more spin": _how_fast(motion, "spin", motion.omega_rad_s),
+    }
+    found = [
+        Family({f"{same} {words}": own.times(factor) for words, factor in family.items()}, then)
+        for then, family in factors.items()
+    ]
+    return [family for family in (*found, _swinging(motion, own)) if family.forms]
 
 
 def _usual_flight_s(lengths_s: Tensor) -> float:
@@ -90,7 +106,7 @@ def _swinging(motion: FlownMotion, own: ForceField) -> Family:
         swing = torch.sin(math.pi * (2 * periods * since / usual + phase))
         at = f" in phase {180 * phase:.0f} deg" if phase else ""
         found[f"{words}, swinging at {periods / usual:.2g} Hz{at}"] = own.times(swing)
-    return found
+    return Family(found, "record longer flights")
 
 
 def _where(motion: FlownMotion, name: str, values: Tensor) -> Mapping[str, Tensor]:

@@ -56,6 +56,8 @@ class OtherForms:
     """Twice the logarithm of the odds of that form against the effect's own law."""
     odds: float
     """Twice the logarithm of the odds of all forms against the effect's own law."""
+    then: str
+    """What to record next to tell that form from the effect."""
 
     @property
     def likelier(self) -> bool:
@@ -100,7 +102,7 @@ def other_forms(
         other = [one for one in kept if one.effect.name not in _alike(named)]
         more = [one for one in variants_of(other, world.gravity[0, :1]) if acts_in(one, "flight")]
         families = families_of(motion, own, named)
-        forms = {words: field for family in families for words, field in family.items()}
+        forms = {words: field for family in families for words, field in family.forms.items()}
         fit = FormFit.of(motion, active[named[0]], [own, *forms.values()], more, scales)
         found.append(_compared(fit, named[0], families, dispersion))
     return found
@@ -124,7 +126,7 @@ def _alike(named: Sequence[str]) -> set[str]:
 
 def _compared(fit: FormFit, name: str, families: Sequence[Family], dispersion: float) -> OtherForms:
     """Compare an effect, whose own law is the first form, with families of others, each with one more effect or not."""
-    forms = [words for family in families for words in family]
+    forms = [words for family in families for words in family.forms]
     tried = [_tried(fit, columns, dispersion) for columns in fit.forms]
     likeliest = min(
         (cost for groups in tried for group in groups for law in group for cost, _ in law), key=lambda c: c.chi2
@@ -140,8 +142,9 @@ def _compared(fit: FormFit, name: str, families: Sequence[Family], dispersion: f
     ]
     half = {words: log - logs[0] for words, log in zip(forms, logs[1:], strict=True)}
     best = max(half, key=lambda one: half[one])
-    together = [_log_mean([half[words] for words in family]) for family in families]
-    return OtherForms(effect=name, words=best, gain=2 * half[best], odds=2 * _log_mean(together))
+    together = [_log_mean([half[words] for words in family.forms]) for family in families]
+    then = next(family.then for family in families if best in family.forms)
+    return OtherForms(effect=name, words=best, gain=2 * half[best], odds=2 * _log_mean(together), then=then)
 
 
 Tried = list[list[list[tuple[FormCost, int]]]]

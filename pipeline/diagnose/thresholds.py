@@ -321,7 +321,7 @@ class VerdictThresholds:
         "2 log odds",
         "a force is not named, and alone it is `unexplained`, unless its own law is likelier by odds of 2 than other "
         "forms of it (during a part of the flights, above a height, on one side of a place, by another power of speed "
-        "or spin)",
+        "or spin, above or below one of these alone, or swinging)",
         "by argument: a wrong name is worse than none; before likelihoods were those of Student's distribution, at -1, "
         "0 and 2, of 129 real-like development captures that hide what is in no library 3, 5 and 9 got a wrong name "
         "(20 without), and 9, 6 and 2 of 80 true names were lost",

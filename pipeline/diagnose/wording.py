@@ -75,7 +75,9 @@ def _nearest(findings: Findings) -> str:
         if form.likelier and form.gain > 0:
             words.append(f" Nearest is {form.effect}, but the flights fit {form.words} better.")
         elif form.likelier:
-            words.append(f" Nearest is {form.effect}, but the flights hardly tell it from {form.words}.")
+            words.append(
+                f" Nearest is {form.effect}, but these flights hardly tell it from {form.words}. Next, {form.then}."
+            )
     return "".join(words)
 
 
@@ -251,7 +253,7 @@ def misfit_warnings(findings: Findings) -> list[str]:
 
 def law_warnings(findings: Findings) -> list[str]:
     """Return a warning for each effect whose motions fit another law equally well."""
-    found = [f"{form.effect}: these flights fit {form.words} as well." for form in findings.as_good]
+    found = [f"{form.effect}: these flights fit {form.words} as well. Next, {form.then}." for form in findings.as_good]
     return found + [
         f"{name}: not named, since the slides fit a friction limited along each of two axes by itself as well, as "
         "engines with a friction pyramid have it and no surface does. Next, where they were measured on a surface, "

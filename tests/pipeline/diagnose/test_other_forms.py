@@ -1,5 +1,6 @@
-"""A named force is told from forms of it that are in no library: one that sets in late, another power of the spin."""
+"""A named force is told from forms of it that are in no library: one that sets in late, swings, or acts at speed."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,9 @@ from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.segments.segment_fit import refit
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.diagnosis_data import tosses, world_with
+from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 NOISE = Noise(3e-4, 1e-3)
 LIBRARY = ("gravity_scale", "gravity_tilt", "linear_drag", "magnus_lift", "spin_damping")
 
@@ -35,6 +38,19 @@ class SpinDampingBySquare(Effect):
         return Wrench(torque=-values["q"][:, None] * motion.omega.norm(dim=-1, keepdim=True) * momentum)
 
 
+class DragAboveSpeed(Effect):
+    """a = -c v above 1.6 m/s, which is in no library."""
+
+    name = "drag_above_speed"
+    summary = formula = reveals = source = "a = -c v where v > 1.6 m/s"
+    parameters = (EffectParameter(name="c", unit="1/s", scale=0.1, limit=5.0),)
+    phase = "flight"
+
+    def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
+        fast = (motion.velocity.norm(dim=-1, keepdim=True) > 1.6).to(motion.velocity)
+        return Wrench(force=-motion.mass[:, None] * values["c"][:, None] * fast * motion.velocity)
+
+
 class ForceByHeight(Effect):
     """An upward acceleration f z, which is in no library."""
 
@@ -48,19 +64,28 @@ class ForceByHeight(Effect):
         return Wrench(force=motion.mass[:, None] * values["f"][:, None] * height * motion.up)
 
 
-def late(track: Track) -> Track:
-    """Push the body upwards from 0.2 s on."""
-    since = np.clip(track.time_s - 0.2, 0.0, None)
-    return replace(track, position_m=track.position_m + 0.5 * since[:, None] ** 2 * np.array([0.0, 0.0, 1.0]))
+def late(time_s: Array) -> Array:
+    """Return how far a push upwards from 0.2 s on moves a body [m]."""
+    return 0.5 * np.clip(time_s - 0.2, 0.0, None) ** 2
 
 
-def form_of(truth: World, named: str, late_push: bool = False) -> OtherForms:
-    """Return the other forms of an effect that is fitted to tosses of another world."""
+def swinging(time_s: Array) -> Array:
+    """Return how far a push upwards that swings at 4 Hz moves a body [m]."""
+    rate = 2 * np.pi * 4
+    return time_s / rate - np.sin(rate * time_s) / rate**2
+
+
+def form_of(truth: World, named: str, push: Callable[[Array], Array] | None = None) -> OtherForms:
+    """Return the other forms of an effect that is fitted to tosses of another world, and pushed upwards beside it."""
     episodes = tosses(truth, 3, 4, 0.4, 60.0, NOISE, (0.9, 1.2))
-    if late_push:
-        episodes = [(name, {body: late(track) for body, track in tracks.items()}) for name, tracks in episodes]
+    if push is not None:
+        episodes = [(name, {body: _pushed(track, push) for body, track in tracks.items()}) for name, tracks in episodes]
     plain = replace(truth, effects=())
     return forms_of(plain, episodes, [named])[0]
+
+
+def _pushed(track: Track, push: Callable[[Array], Array]) -> Track:
+    return replace(track, position_m=track.position_m + push(track.time_s)[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
 def forms_of(plain: World, episodes: list[tuple[str, dict[str, Track]]], names: list[str]) -> list[OtherForms]:
@@ -85,9 +110,17 @@ def test_the_law_of_a_true_effect_is_likelier_than_its_forms(name: str, values: 
     assert not form_of(world_with("ball", {name: values}), name).likelier
 
 
-def test_a_force_that_sets_in_late_is_no_other_gravity() -> None:
-    found = form_of(world_with("ball"), "gravity_scale", late_push=True)
-    assert found.likelier and "flight" in found.words
+@pytest.mark.parametrize(("push", "word"), [(late, "flight"), (swinging, "swinging at")])
+def test_a_force_that_sets_in_late_or_swings_is_no_other_gravity(push: Callable[[Array], Array], word: str) -> None:
+    found = form_of(world_with("ball"), "gravity_scale", push)
+    assert found.likelier and word in found.words
+
+
+def test_a_drag_above_a_speed_is_no_drag() -> None:
+    ball = world_with("ball")
+    braked = replace(ball, effects=(ActiveEffect.of(DragAboveSpeed(), {"c": 0.3}, ball.gravity[0, :1]),))
+    found = form_of(braked, "linear_drag")
+    assert found.likelier and "where the speed is above" in found.words and "faster" in found.then
 
 
 def test_a_damping_by_the_square_of_the_spin_is_no_spin_damping() -> None:
@@ -108,12 +141,12 @@ def test_a_force_by_height_is_not_two_effects_that_imitate_it_together() -> None
     ("gain", "odds", "words"),
     [
         (3.0, 1.0, " Nearest is wind, but the flights fit the same force times x better."),
-        (-2.0, -1.0, " Nearest is wind, but the flights hardly tell it from the same force times x."),
+        (-2.0, -1.0, " Nearest is wind, but these flights hardly tell it from the same force times x. Next, go on."),
         (1.0, -2.0, ""),
     ],
 )
 def test_the_sentence_says_in_which_other_form_a_force_comes_near(gain: float, odds: float, words: str) -> None:
-    form = OtherForms(effect="wind", words="the same force times x", gain=gain, odds=odds)
+    form = OtherForms(effect="wind", words="the same force times x", gain=gain, odds=odds, then="go on")
     findings: Any = SimpleNamespace(flight=SimpleNamespace(others=[form]))
     assert wording._nearest(findings) == words
 
