@@ -120,4 +120,5 @@ def _order(table: Tensor) -> Tensor:
 @cache
 def _library(structure: Structure, wide: int = 0) -> ctypes.CDLL:
     source = kernel_file("host_prelude") + structure.source(host=True, wide=wide) + kernel_file("host_entry")
-    return kernel_build.host_library(source, (*FLAGS, *((*kernel_build.vector_flags(), *WIDE_FLAGS) if wide else ())))
+    vectors = kernel_build.vector_flags() if wide or structure.hulled else ()
+    return kernel_build.host_library(source, (*FLAGS, *vectors, *(WIDE_FLAGS if wide else ())))

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 MOST_CONTACTS = 16_384
 """Maximum number of possible contacts of an environment."""
+_PLANES, _NO_PLANE_M = 8, 1e30
+"""Faces of a hull that are compared at once, and the distance of those that are added to fill the last ones [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +48,8 @@ class Packed:
     geometry: Tensor
     """Centres in the body frame and radii of the spheres [m]; then of each hull three rows a face, as `Hull.faces`,
     one row an edge and one a support: the indices of their spheres within the body; of each edge between different
-    planes the indices and two vectors, as `Hull.inward`; shape (1 or B, rows, 4).
+    planes the indices and two vectors, as `Hull.inward`; and the faces again, as in `_hull_rows`; shape
+    (1 or B, rows, 4).
     """
     surfaces: Tensor
     """Positions [m], orientations and sizes [m] of the fixed surfaces, shape (1 or B, surfaces, 10)."""
@@ -259,7 +262,7 @@ def _hulls(world: World) -> tuple[tuple[int, int, int, int, int], ...]:
 
 def _hull_size(faces: int, edges: int, supports: int, ridges: int) -> int:
     """Return the number of rows of a hull in the geometry, as in `_hull_rows`."""
-    return 3 * faces + edges + supports + 3 * ridges
+    return 3 * faces + edges + supports + 3 * (ridges + _PLANES * -(-faces // _PLANES))
 
 
 def _steps(laws: Sequence[ContactLaw], times: Tensor, substeps: Tensor) -> Tensor:
@@ -345,7 +348,11 @@ def _surface(surface: FixedSurface, turn: Tensor | None) -> Tensor:
 
 
 def _hull_rows(body: Body) -> list[Tensor]:
-    """Return the rows of faces, edges, supports and ridges of a body's hull (1, rows, 4); none without a hull."""
+    """Return the rows of faces, edges, supports and ridges of a body's hull (1, rows, 4); none without a hull.
+
+    The numbers of the faces follow once more, the first of all faces, then the second of all, as vectors of a processor
+    take them; faces that are added to whole vectors have no normal and are never the highest.
+    """
     hull = body.hull
     if hull is None:
         return []
@@ -354,7 +361,9 @@ def _hull_rows(body: Body) -> list[Tensor]:
         return torch.nn.functional.pad(x, (0, 4 - x.shape[-1])).to(hull.faces)
 
     ridges = torch.cat((rows(hull.ridges)[:, None], rows(hull.inward)), 1)
-    parts = (hull.faces, rows(hull.edges), rows(hull.supports[:, None]), ridges)
+    planes = torch.nn.functional.pad(hull.faces.reshape(-1, 12), (0, 0, 0, -len(hull.faces) % _PLANES))
+    planes[len(hull.faces) :, 3] = _NO_PLANE_M
+    parts = (hull.faces, rows(hull.edges), rows(hull.supports[:, None]), ridges, planes.T)
     return [part.reshape(1, -1, 4) for part in parts]
 
 

@@ -235,6 +235,11 @@ class Structure:
         return self._unrolled and not (self.record and self.slots > _FREE_SLOTS[False, False])
 
     @property
+    def hulled(self) -> bool:
+        """Whether hulls of bodies may touch each other or a surface."""
+        return self.paired and any(faces for _, faces, *_ in self.hulls)
+
+    @property
     def widens(self) -> bool:
         """Whether a CPU can simulate several environments in one vector: one free body above the ground, no records."""
         alone = self.free == (True,) and not self.paired and self.tree is None and set(self.drives) == {-1}
@@ -278,7 +283,7 @@ class Structure:
         """Return the constants by name, those of chains aside."""
         paired = self.paired
         alone = host and self.lanes == 1  # one thread of a CPU, whose arrays lie in its cache
-        hulls = paired and any(faces for _, faces, *_ in self.hulls)
+        hulls = self.hulled
         held = not paired and (alone or self._fits_registers)
         queued = self.shared and not hulls
         # contacts with ground and surfaces may be two more of a pair than the even share of a lane

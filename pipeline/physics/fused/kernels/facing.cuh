@@ -33,6 +33,28 @@ INLINE Hull hull_of(const Problem& problem, const Environment& env, int b) {
     return hull;
 }
 
+#if PACKED
+const int SWARM_ROOM = 64;  // whole vectors
+
+struct Plain {  // a rotation without derivatives
+    Number at[3][3];
+    explicit Plain(const Mat& R)
+        : at{{plain(R.x.x), plain(R.x.y), plain(R.x.z)},
+             {plain(R.y.x), plain(R.y.y), plain(R.y.z)},
+             {plain(R.z.x), plain(R.z.y), plain(R.z.z)}} {}
+};
+
+struct Swarm {  // up to SWARM_ROOM spheres of a body: coordinates of their centres, and radii
+    Number at[4][SWARM_ROOM];
+    explicit Swarm(const Union& spheres) {
+        const Number* rows = spheres.geometry.value + spheres.first;
+        for (int i = 0; i < spheres.count; i++) {
+            for (int k = 0; k < 4; k++) at[k][i] = rows[4 * i + k];
+        }
+    }
+};
+#endif
+
 // Raises `most` to the greatest height that the spheres of another hull have over a plane of this one; sets `axis` to
 // the normal of that plane, in the world frame, times `sign`.
 INLINE void part_by(const Problem& problem, const Environment& env, int b, int other, const Mat* rotations,
@@ -41,6 +63,25 @@ INLINE void part_by(const Problem& problem, const Environment& env, int b, int o
     Vec origin = env.bodies[other].position - rotations[other] * env.constants[other].com - env.bodies[b].position;
     Vec shift = transposed(rotations[b], origin) + env.constants[b].com;
     Number from[3] = {plain(shift.x), plain(shift.y), plain(shift.z)};
+#if PACKED
+    const Plain R(rotations[b]), Q(rotations[other]);
+    for (int i = 0; i < hull.faces; i += 8) {
+        Eight own[3], normal[3], within[3], least = Eight{} + Number(1e30);
+        for (int k = 0; k < 3; k++) own[k] = eight_at(hull.plane(k, i));
+        for (int k = 0; k < 3; k++) normal[k] = R.at[k][0] * own[0] + R.at[k][1] * own[1] + R.at[k][2] * own[2];
+        for (int k = 0; k < 3; k++) within[k] = Q.at[0][k] * normal[0] + Q.at[1][k] * normal[1] + Q.at[2][k] * normal[2];
+        for (int k = 0; k < its.supports; k++) {
+            const Number* s = its.support(k);
+            least = lesser(within[0] * s[0] + within[1] * s[1] + within[2] * s[2] - s[3], least);
+        }
+        least += own[0] * from[0] + own[1] * from[1] + own[2] * from[2] - eight_at(hull.plane(3, i));
+        for (int k = 0; k < 8; k++) {
+            if (!(least[k] > most)) continue;
+            most = least[k];
+            for (int j = 0; j < 3; j++) axis[j] = sign * normal[j][k];
+        }
+    }
+#else
     for (int i = 0; i < hull.faces; i++) {
         Vec normal = rotations[b] * problem.geometry.vector(hull.row + 12LL * i);
         Vec within = transposed(rotations[other], normal);
@@ -60,6 +101,7 @@ INLINE void part_by(const Problem& problem, const Environment& env, int b, int o
         axis[1] = sign * plain(normal.y);
         axis[2] = sign * plain(normal.z);
     }
+#endif
 }
 
 // Returns the face of a body whose normal is nearest to `sign` times the axis; -1 where none is parallel to it.
@@ -117,6 +159,44 @@ struct Met {  // edges of two hulls that may be a contact, without derivatives
     int edge, other;  // of a, and the number of the near edge of b
     bool leaves;      // as `edge_leaves`
     Number gap, normal[3];
+};
+#endif
+
+#if PACKED
+struct Fan {  // edges of one hull without derivatives, one vector of numbers after another
+    Number along[3][NEAR_ROOM], inward[3][NEAR_ROOM], other[3][NEAR_ROOM], both[3][NEAR_ROOM];
+    INLINE void put(int i, const Edge& edge) {
+        const Vec vectors[4] = {edge.along, edge.inward, edge.other_inward, edge.inward + edge.other_inward};
+        Number (*const arrays[4])[NEAR_ROOM] = {along, inward, other, both};
+        for (int k = 0; k < 4; k++) {
+            arrays[k][0][i] = plain(vectors[k].x);
+            arrays[k][1][i] = plain(vectors[k].y);
+            arrays[k][2][i] = plain(vectors[k].z);
+        }
+    }
+    // Marks those of eight edges from edge `from` on that do not surely lean: as `surely_lean`.
+    INLINE int upright(int from, const Edge& second, Number bound) const {
+        Eight a[3], i[3], o[3], s[3];
+        for (int k = 0; k < 3; k++) {
+            s[k] = eight_at(both[k] + from);
+            a[k] = eight_at(along[k] + from);
+            i[k] = eight_at(inward[k] + from);
+            o[k] = eight_at(other[k] + from);
+        }
+        const Number b[3] = {plain(second.along.x), plain(second.along.y), plain(second.along.z)};
+        const Number si[3] = {plain(second.inward.x), plain(second.inward.y), plain(second.inward.z)};
+        const Number so[3] = {plain(second.other_inward.x), plain(second.other_inward.y), plain(second.other_inward.z)};
+        const Eight x = a[1] * b[2] - a[2] * b[1], y = a[2] * b[0] - a[0] * b[2], z = a[0] * b[1] - a[1] * b[0];
+        const Eight first = x * i[0] + y * i[1] + z * i[2], next = x * o[0] + y * o[1] + z * o[2];
+        const Eight third = x * si[0] + y * si[1] + z * si[2], last = x * so[0] + y * so[1] + z * so[2];
+        const Eight side = s[0] * x + s[1] * y + s[2] * z > Number(0) ? Eight{} - Number(1) : Eight{} + Number(1);
+        const Eight most = greater(greater(side * first, side * next), -lesser(side * third, side * last));
+        const Number least = bound + Number(1e-6);
+        const auto leans = (most > Number(0)) & (most * most > least * least * (x * x + y * y + z * z));
+        int marks = 0;
+        for (int k = 0; k < 8; k++) marks |= (int)(leans[k] == 0) << k;
+        return marks;
+    }
 };
 #endif
 
@@ -179,6 +259,22 @@ const int MARKED_ROOM = 64;
 // Marks for each sphere of a hull the sides of a body's box beyond which it is, by more than a margin; `turn` and `shift`
 // bring it into the frame of that body.
 INLINE void mark_sides(const Constants& body, const Hull& hull, const Mat& turn, Vec shift, Number margin, int* sides) {
+#if PACKED
+    const Plain R(turn);
+    const Number from[3] = {plain(shift.x), plain(shift.y), plain(shift.z)};
+    Swarm swarm(hull.spheres);
+    for (int i = 0; i < hull.spheres.count; i += 8) {
+        const Eight x = eight_at(swarm.at[0] + i), y = eight_at(swarm.at[1] + i), z = eight_at(swarm.at[2] + i);
+        const Eight far = eight_at(swarm.at[3] + i) + margin;
+        decltype(x < y) marks = {};
+        for (int k = 0; k < 3; k++) {
+            const Eight at = from[k] + (R.at[k][0] * x + R.at[k][1] * y + R.at[k][2] * z);
+            marks |= (at > body.high[k] + far) & 1 << 2 * k;
+            marks |= (at < body.low[k] - far) & 1 << (2 * k + 1);
+        }
+        for (int k = 0; k < 8; k++) sides[i + k] = (int)marks[k];
+    }
+#else
     for (int i = 0; i < hull.spheres.count; i++) {
         const Vec center = shift + turn * hull.spheres.center(i);
         const Number at[3] = {plain(center.x), plain(center.y), plain(center.z)};
@@ -188,6 +284,7 @@ INLINE void mark_sides(const Constants& body, const Hull& hull, const Mat& turn,
             sides[i] |= (int)(at[k] > body.high[k] + far) << 2 * k | (int)(at[k] < body.low[k] - far) << (2 * k + 1);
         }
     }
+#endif
 }
 
 // Lists the edges of a hull of which no side of a body's box has both ends beyond it.
@@ -249,6 +346,24 @@ INLINE Number gap_along(const Problem& problem, const Environment& env, int a, i
     return -ends[1] - ends[0];
 }
 
+// Raises `most` to the gap along the common normal of two edges, the second of them number `n` of the near ones of b, and
+// sets the axis to it. On a CPU, edges that may be a contact are noted.
+INLINE void part_by_edges(const Edge& first, const Edge& second, int edge, int n, Number limit, const Mat& rotation,
+                          Parting& found, Number& most) {
+    Crossing crossing;
+    if (!cross_edges(first, second, crossing)) return;
+#if HOST
+    if (crossing.lean > Number(OUT_OF_FACE)) return;
+    if (crossing.within && plain(crossing.gap) < limit) found.meet(edge, n, crossing);
+#endif
+    if (crossing.lean > Number(0) || !(plain(crossing.gap) > most)) return;
+    most = plain(crossing.gap);
+    Vec normal = rotation * crossing.normal;
+    found.axis[0] = plain(normal.x);
+    found.axis[1] = plain(normal.y);
+    found.axis[2] = plain(normal.z);
+}
+
 // Finds how the hulls of two bodies part best; false where they are not compared. Where a face parts them by more than
 // `limit`, edges are not looked at.
 __device__ bool part(const Problem& problem, const Environment& env, int p, const Mat* rotations, Number limit,
@@ -280,29 +395,36 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
     for (int n = 0; n < found.near_b.count; n++) found.placed_b[n] = edge_in(found, hull_b, found.near_b.edge(n));
     found.met_count = 0;
     found.marks = 0;
+#endif
+#if PACKED
     Edge placed_a[NEAR_ROOM];
-    for (int m = 0; m < found.near_a.count; m++) placed_a[m] = edge_of(hull_a, found.near_a.edge(m));
+    Fan fan;
+    for (int m = 0; m < found.near_a.count; m++) {
+        placed_a[m] = edge_of(hull_a, found.near_a.edge(m));
+        fan.put(m, placed_a[m]);
+    }
 #endif
     Number most = found.gap;
     for (int n = 0; n < found.near_b.many(hull_b.ridges); n++) {
         Edge second = near_edge(found, hull_b, n);
-        for (int m = 0; m < found.near_a.many(hull_a.ridges); m++) {
-            Crossing crossing;
-#if HOST
-            const Edge first = found.near_a.count >= 0 ? placed_a[m] : edge_of(hull_a, m);
-            if (surely_lean(first, second, Number(OUT_OF_FACE)) || !cross_edges(first, second, crossing)) continue;
-            if (crossing.lean > Number(OUT_OF_FACE)) continue;
-            if (crossing.within && plain(crossing.gap) < limit) found.meet(found.near_a.edge(m), n, crossing);
-#else
-            const Edge first = edge_of(hull_a, found.near_a.edge(m));
-            if (!cross_edges(first, second, crossing)) continue;
+#if PACKED
+        if (found.near_a.count >= 0) {
+            for (int from = 0; from < found.near_a.count; from += 8) {
+                for (int marks = fan.upright(from, second, Number(OUT_OF_FACE)); marks != 0; marks &= marks - 1) {
+                    const int m = from + __builtin_ctz(marks);
+                    if (m >= found.near_a.count) break;
+                    part_by_edges(placed_a[m], second, found.near_a.edge(m), n, limit, rotations[a], found, most);
+                }
+            }
+            continue;
+        }
 #endif
-            if (crossing.lean > Number(0) || !(plain(crossing.gap) > most)) continue;
-            most = plain(crossing.gap);
-            Vec normal = rotations[a] * crossing.normal;
-            found.axis[0] = plain(normal.x);
-            found.axis[1] = plain(normal.y);
-            found.axis[2] = plain(normal.z);
+        for (int m = 0; m < found.near_a.many(hull_a.ridges); m++) {
+            const Edge first = edge_of(hull_a, found.near_a.edge(m));
+#if HOST
+            if (surely_lean(first, second, Number(OUT_OF_FACE))) continue;
+#endif
+            part_by_edges(first, second, found.near_a.edge(m), n, limit, rotations[a], found, most);
         }
     }
     if (!(most > found.gap)) return true;

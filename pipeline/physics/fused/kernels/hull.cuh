@@ -2,6 +2,23 @@
 // `physics/edge_contact.py`.
 #if PAIRED
 #if HULLS
+// On a CPU, eight numbers at once: g++ has vectors of any length, which it puts into those of the processor. Nothing is
+// summed in another order, so that results have the bits of those that are computed one by one.
+#if HOST && defined(__GNUC__) && !defined(__clang__)
+#define PACKED 1
+#pragma GCC diagnostic ignored "-Wpsabi"  // such vectors stay within this program
+typedef Number Eight __attribute__((vector_size(8 * sizeof(Number))));
+INLINE Eight eight_at(const Number* from) {
+    Eight all;
+    __builtin_memcpy(&all, from, sizeof(all));
+    return all;
+}
+INLINE Eight lesser(Eight a, Eight b) { return a < b ? a : b; }
+INLINE Eight greater(Eight a, Eight b) { return a > b ? a : b; }
+#else
+#define PACKED 0
+#endif
+
 struct Hull {  // of a body's spheres, in its frame: see physics/hull.py
     Union spheres;
     long long row;  // of the first face
@@ -12,6 +29,15 @@ struct Hull {  // of a body's spheres, in its frame: see physics/hull.py
         Number sum = f[0] * p[0] + f[1] * p[1] + f[2] * p[2];
         return k == 0 ? sum - f[3] : sum + f[3];
     }
+#if PACKED
+    // The same of eight faces from face `i` on.
+    INLINE Eight affine_of_eight(int i, int k, const Number* p) const {
+        const Eight sum = eight_at(plane(4 * k, i)) * p[0] + eight_at(plane(4 * k + 1, i)) * p[1] +
+                          eight_at(plane(4 * k + 2, i)) * p[2];
+        const Eight last = eight_at(plane(4 * k + 3, i));
+        return k == 0 ? sum - last : sum + last;
+    }
+#endif
     // Whether the foot of a point lies within a face, or beyond its border by at most `margin`.
     INLINE bool over(int i, const Number* p, Number margin) const {
         const Number *a = spheres.geometry.value + row + 12LL * i + 4, *b = a + 4;
@@ -42,6 +68,12 @@ struct Hull {  // of a body's spheres, in its frame: see physics/hull.py
     }
     // First row of an edge between faces in different planes: its spheres, then vectors away from it in both faces.
     INLINE long long ridge(int i) const { return row + 4LL * (3 * faces + edges + supports + 3 * i); }
+    // Number of faces in the copy of their numbers below.
+    INLINE int planes() const { return (faces + 7) / 8 * 8; }
+    // Number `k` of 12 of the faces from face `i` on, as in `_hull_rows`.
+    INLINE const Number* plane(int k, int i) const {
+        return spheres.geometry.value + ridge(ridges) + (long long)k * planes() + i;
+    }
 };
 
 struct Edge {  // between two faces of a hull, in any frame: see physics/edge_contact.py
@@ -160,6 +192,23 @@ __device__ bool distance_to_hull(const Hull& hull, Vec at, int flat, Number limi
     }
     Number most = Number(-1e30), best = Number(-1e30);
     int face = 0;
+#if PACKED
+    Eight above = Eight{} + most;
+    for (int i = 0; i < hull.faces; i += 8) above = greater(hull.affine_of_eight(i, 0, p), above);
+    for (int k = 0; k < 8; k++) most = greater(most, above[k]);
+    if (most > limit) return false;
+    for (int i = 0; i < hull.faces; i += 8) {
+        const Eight height = hull.affine_of_eight(i, 0, p), second = hull.affine_of_eight(i, 1, p),
+                    third = hull.affine_of_eight(i, 2, p);
+        const auto beside = (second < Number(0)) | (third < Number(0)) | (second + third > Number(1));
+        const Eight over = beside ? Eight{} + Number(-1e30) : height;
+        for (int k = 0; k < 8; k++) {
+            if (!(over[k] > best)) continue;
+            best = over[k];
+            face = i + k;
+        }
+    }
+#else
     for (int i = 0; i < hull.faces; i++) {
         Number height = hull.affine(i, 0, p);
         most = greater(most, height);
@@ -169,6 +218,7 @@ __device__ bool distance_to_hull(const Hull& hull, Vec at, int flat, Number limi
         best = height;
         face = i;
     }
+#endif
     if (most > limit) return false;  // no point of the hull is nearer than any of its planes
     if (best > Number(0) || best >= most - Number(SAME_PLANE_M)) {
         long long row = hull.row + 12LL * face;

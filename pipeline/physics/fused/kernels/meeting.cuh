@@ -42,6 +42,26 @@ INLINE bool beside(const Constants& other, const Frame& frame, const Number* sph
     return far2 > bound * bound;
 }
 
+#if HULLS && PACKED
+// Marks the spheres of a body that are beside another body: as `beside`.
+INLINE void mark_beside(const Constants& other, const Frame& frame, const Swarm& swarm, int count, Number limit,
+                        bool* marks) {
+    for (int i = 0; i < count; i += 8) {
+        const Eight x = eight_at(swarm.at[0] + i), y = eight_at(swarm.at[1] + i), z = eight_at(swarm.at[2] + i);
+        const Eight bound = Number(1 + 1e-5) * (limit + eight_at(swarm.at[3] + i) + Number(SMOOTHING_M));
+        Eight far2 = {};
+        for (int k = 0; k < 3; k++) {
+            const Number* row = frame.turn + 3 * k;
+            const Eight at = row[0] * x + row[1] * y + row[2] * z + frame.shift[k];
+            const Eight out = greater(other.low[k] - at, at - other.high[k]);
+            far2 += out > Number(0) ? out * out : Eight{};
+        }
+        const auto far = far2 > bound * bound;
+        for (int k = 0; k < 8; k++) marks[i + k] = far[k] != 0;
+    }
+}
+#endif
+
 // Whether the box of a body's spheres is beyond a side of that of another body by more than a margin.
 INLINE bool boxes_apart(const Constants& ours, const Constants& other, const Frame& frame, Number margin) {
     for (int i = 0; i < 3; i++) {

@@ -30,13 +30,30 @@ __device__ int touch_pair(const Problem& problem, Environment& env, const Own& o
 #endif
     if (near) {
         const int start = contact_start(p), spheres_of_b = sphere_count(b), spheres_in_all = spheres_of_b + sphere_count(a);
+#if HULLS && PACKED
+        bool beside_all[2 * SWARM_ROOM];
+        const bool marked = spheres_of_b <= SWARM_ROOM && sphere_count(a) <= SWARM_ROOM;
+        INNER for (int side = 0; marked && side < 2; side++) {
+            const int mine = side ? a : b;
+            const Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(mine), sphere_count(mine)};
+            mark_beside(side ? cb : ca, reach.frames[side], Swarm(spheres), spheres.count, reach.limit,
+                        beside_all + side * SWARM_ROOM);
+        }
+#endif
         EACH_OWNED(own.lanes, start, contact_count(p), k) {
             if (k < spheres_in_all) {
                 const bool second = k >= spheres_of_b;
-                const Number* sphere = problem.geometry.value + env.geometry + 4LL * problem.spheres[start + k];
-                if (beside(second ? cb : ca, reach.frames[second], sphere, reach.limit)) continue;
+#if HULLS && PACKED
+                if (marked && beside_all[second ? SWARM_ROOM + k - spheres_of_b : k]) continue;
+                if (!marked)
+#endif
+                {
+                    const Number* sphere = problem.geometry.value + env.geometry + 4LL * problem.spheres[start + k];
+                    if (beside(second ? cb : ca, reach.frames[second], sphere, reach.limit)) continue;
+                }
             }
 #if HOST && HULLS
+            else if (parting.met_count == 0) break;
             else if (parting.never(k - spheres_in_all)) continue;
 #endif
             const Vec before = own.warm ? own.before[(start + k) / LANES] : none();
