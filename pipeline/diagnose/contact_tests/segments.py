@@ -10,7 +10,8 @@ downweighted, and the effect has to improve held-out episodes and to exceed its 
 
 The segments are linearised without candidates first. Where one that can be named has a positive score there, it and its
 rivals are fitted, and each is judged where it fits (`candidate_fit`), in states that all fits share: a large effect is
-far from linear, and a state found without it hides it.
+far from linear, and a state found without it hides it. Beside an effect of flight, what slides do not show, too, cannot
+be named, whatever its fit explains, and is not fitted.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class SegmentsTest(ContactTest):
         if data.segments is None or not variants:
             return []
         first = _ranked(_linear_tests(data, data.segments, candidates, variants), data)
-        if not any(self._is_likely(one) for one in first):
+        if not any(self._is_likely(one) for one in first) or not any(self._can_be_named(one, data) for one in first):
             return first
         fitted = [one for one in first if _can_be_fitted(one)]
         none, fits = candidate_fits(data.segments, data.world, fitted, data.prepared.groups)
@@ -85,23 +86,38 @@ class SegmentsTest(ContactTest):
         single = len(one.candidate.effect.parameters) <= self.limits.few_parameters
         return single and one.name in dict(self.limits.alone) and one.score > self.limits.first_score
 
+    def _can_be_named(self, one: Evidence, data: ContactData) -> bool:
+        """Return whether an effect with a score where it is absent could pass a bar, whatever its fit explains."""
+        return one.score > self.limits.first_score and (self._is_shown(one, data) or self._stands_alone(one, data))
+
+    def _is_shown(self, one: Evidence, data: ContactData) -> bool:
+        """Return whether slides show an effect, too, so that a small score confirms it."""
+        shown, slides = _first_of_slides(data), THRESHOLDS.sliding
+        hidden = one.name in (*slides.in_impacts_alone, *slides.as_friction)
+        hidden = hidden or len(one.candidate.effect.parameters) > self.limits.few_parameters
+        return shown is not None and shown.name == one.name and shown.score > self.limits.shown_score and not hidden
+
+    def _stands_alone(self, one: Evidence, data: ContactData) -> bool:
+        """Return whether segments alone may name an effect.
+
+        What is unexplained in flight acts on the ground, too, and the law of a named effect is never exactly true.
+        """
+        clear = data.explained and not data.flown
+        return one.name in dict(self.limits.alone) and (clear or one.name in self.limits.unlike_laws)
+
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
         """Return the lead in score over effects that improve held-out episodes."""
         return (Lead(share=self.limits.lead_share, rival=Bar(gain_t=self.limits.gain_t)),)
 
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bars of an effect: where slides show it, too, and where segments alone do."""
-        best, shown, slides = equals[0], _first_of_slides(data), THRESHOLDS.sliding
+        best, found = equals[0], []
         if best.falls_at_rest or not repeats(best, 1) or best.first_score <= self.limits.first_score:
             return ()
-        found, hidden = [], best.name in (*slides.in_impacts_alone, *slides.as_friction)
-        hidden = hidden or len(best.candidate.effect.parameters) > self.limits.few_parameters
-        if shown is not None and shown.name == best.name and shown.score > self.limits.shown_score and not hidden:
+        if self._is_shown(best, data):
             found.append(Bar(score=self.limits.agreed_score, gain_t=self.limits.gain_t))
-        alone = dict(self.limits.alone).get(best.name)
-        # what is unexplained in flight acts on the ground, too, and the law of a named effect is never exactly true
-        clear = data.explained and not data.flown
-        if alone is not None and (clear or best.name in self.limits.unlike_laws):
+        if self._stands_alone(best, data):
+            alone = dict(self.limits.alone)[best.name]
             found.append(Bar(score=alone, gain_t=self.limits.alone_t))
             found.append(Bar(score=self.limits.sure * alone, gain_t=self.limits.gain_t))
         return tuple(found)

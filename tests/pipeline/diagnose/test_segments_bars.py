@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from cgwm.pipeline.diagnose.contact_tests import segments as segments_module
 from cgwm.pipeline.diagnose.contact_tests.segments import SegmentsTest
 from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.falsification import Repetition
@@ -45,6 +46,39 @@ def test_an_effect_that_ranks_first_among_slides_needs_less(name: str) -> None:
         assert bars(evidence(other), sliding=() if other == "ground_magnet" else (other,)) == []
     for other in ("adhesion", "anisotropic_friction"):
         assert bars(evidence(other), sliding=(other,)) == bars(evidence(other)) != []
+
+
+@pytest.mark.parametrize("name", ["viscous_friction", "adhesion", "torsional_friction", "rolling_resistance"])
+@pytest.mark.parametrize("flown", [False, True])
+@pytest.mark.parametrize("slides", [False, True])
+def test_effects_are_fitted_only_where_one_of_them_could_be_named(
+    name: str, flown: bool, slides: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of those that segments alone may name has a score, and one of all with a score has a bar to pass."""
+    shown = [evidence(name, LIMITS.shown_score + 1)] if slides else []
+    data: Any = SimpleNamespace(
+        earlier={"sliding": shown}, flown=flown, explained=True, segments=1, world=1,
+        prepared=SimpleNamespace(groups=()), variants=lambda *_: [SimpleNamespace(active=evidence(name).candidate)],
+    )  # fmt: skip
+
+    def fits(first: list[Evidence]) -> bool:
+        with monkeypatch.context() as patch:
+            patch.setattr(segments_module, "_linear_tests", lambda *_: [])
+            patch.setattr(segments_module, "_ranked", lambda *_: first)
+            patch.setattr(segments_module, "candidate_fits", lambda *_: fitted())
+            try:
+                return SegmentsTest().evidence(data, []) is not first
+            except InterruptedError:
+                return True
+
+    def fitted() -> Any:
+        raise InterruptedError
+
+    one, likely = evidence(name, 1.0), evidence("stribeck_friction", 1.0)
+    could = bool(bars(one, sliding=(name,) if slides else (), flown=flown))
+    assert fits([one, likely]) is (could or not flown)
+    assert fits([one]) is (could and name in dict(LIMITS.alone))
+    assert not fits([replace(one, score=-1.0), replace(likely, score=-1.0)])
 
 
 def test_a_fit_names_no_effect_without_a_score_where_it_is_absent() -> None:
