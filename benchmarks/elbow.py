@@ -183,8 +183,8 @@ class Rival:
         model.geom_pos[model.geom("ground").id, 2] = height
         mujoco.mj_setConst(model, self.data)
 
-    def errors(self, values: Array, tosses: Tosses) -> dict[str, Array]:
-        """Return the errors of fitted coordinates (8,)."""
+    def motion(self, values: Array, tosses: Tosses) -> tuple[Array, Array]:
+        """Return positions (E, T, 2, 3) and quaternions (E, T, 2, 4) of tosses under fitted coordinates (8,)."""
         self.apply(values)
         state = tosses.seen.state
         angle, rate = (x[:, 0].numpy() for x in joints_of(self.world, state, self.world.chains[0]))
@@ -204,7 +204,11 @@ class Rival:
         name = self.world.chains[0].joint_names[0]
         posed = with_joints(self.world, State(position, quat, zero, zero), {name: flat[:, 7]})
         shape = (len(rows), frames, 2)
-        return errors(tosses, posed.position_m.numpy().reshape(*shape, 3), posed.quat_wxyz.numpy().reshape(*shape, 4))
+        return posed.position_m.numpy().reshape(*shape, 3), posed.quat_wxyz.numpy().reshape(*shape, 4)
+
+    def errors(self, values: Array, tosses: Tosses) -> dict[str, Array]:
+        """Return the errors of fitted coordinates (8,)."""
+        return errors(tosses, *self.motion(values, tosses))
 
 
 def surface_errors(drawn: Array, rival: Rival, tosses: Tosses) -> tuple[Array, float]:

@@ -1,4 +1,4 @@
-"""Cost of a sub-step of a robot hand that turns a cube: cgwm on the CPU or CUDA, MuJoCo on the CPU beside it.
+"""Cost of a sub-step of a robot hand that turns a cube: cgwm on the CPU or CUDA, MuJoCo and MuJoCo Warp beside it.
 
     python benchmarks/leap.py leap_hand/robots/hands/leap_hand/leap_hand_right.urdf --environments 64
     python benchmarks/leap.py ... --device cuda --single --environments 4096
@@ -6,12 +6,14 @@
 The hand is the LEAP hand (16 joints; dexsuite/dex-urdf, MIT) with about 160 spheres, the cube has 64. Servos close the
 fingers to random targets at knots, so that the cube is held and rolled. CPU figures are CPU time of the process for
 each environment and sub-step; those of CUDA are wall time of all environments together, from the call to the last
-frame, the median of several rollouts.
+frame, the median of several rollouts. MuJoCo runs on the CPU; MuJoCo Warp, where it is installed, on CUDA.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import itertools
 import json
 import time
 from functools import partial
@@ -29,6 +31,7 @@ from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.fused import simulate_fused
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.sg_gs.link_spheres import link_spheres
+from numpy.typing import NDArray
 from torch import Tensor
 
 HALF_M, SIDE = 0.0325, 4
@@ -132,8 +135,8 @@ def measure(
     }  # fmt: skip
 
 
-def mujoco_cost(urdf: Path, seconds: float, step_s: float) -> dict[str, float]:
-    """Return the CPU time of a step of MuJoCo with the same URDF, servos and cube, one environment."""
+def mujoco_model(urdf: Path, step_s: float) -> Any:
+    """Return MuJoCo's model of the same URDF, servos and cube."""
     import mujoco
 
     text = urdf.read_text()
@@ -155,16 +158,78 @@ def mujoco_cost(urdf: Path, seconds: float, step_s: float) -> dict[str, float]:
     model = spec.compile()
     model.geom_contype[:-1], model.geom_conaffinity[:-1] = 1, 2  # the links touch the cube alone
     model.geom_contype[-1], model.geom_conaffinity[-1] = 2, 1
+    return model
+
+
+def wanted_angles(model: Any, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Return random targets of the joints (count, 16) for a MuJoCo model."""
+    share = 0.35 + 0.3 * rng.random((count, model.nu))
+    return np.clip(share * model.jnt_range[model.actuator_trnid[:, 0], 1], None, 1.2)
+
+
+def mujoco_cost(urdf: Path, seconds: float, step_s: float) -> dict[str, float]:
+    """Return the CPU time of a step of MuJoCo, one environment."""
+    import mujoco
+
+    model = mujoco_model(urdf, step_s)
     data = mujoco.MjData(model)
     rng, count = np.random.default_rng(0), 0
     began, steps = time.process_time(), round(seconds / step_s)
-    upper = model.actuator_trnid[:, 0]
     for k in range(steps):
         if k % max(1, steps // 5) == 0:
-            data.ctrl[:] = np.clip((0.35 + 0.3 * rng.random(model.nu)) * model.jnt_range[upper, 1], None, 1.2)
+            data.ctrl[:] = wanted_angles(model, rng, 1)[0]
         mujoco.mj_step(model, data)
         count += data.ncon
     return {"mujoco_us_a_step": 1e6 * (time.process_time() - began) / steps, "mujoco_contacts": count / steps}
+
+
+def warp_cost(
+    urdf: Path, environments: int, seconds: float, step_s: float, iterations: tuple[int, int] | None
+) -> dict[str, Any]:
+    """Return the steps a second of MuJoCo Warp in a CUDA graph, the median of several rollouts of all environments.
+
+    Args:
+        urdf: The hand.
+        environments: Their number.
+        seconds: Duration of a rollout [s].
+        step_s: Step [s].
+        iterations: Maximum number of iterations of the solver and of its line search; None: MuJoCo's.
+    """
+    import mujoco
+    import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    host = mujoco_model(urdf, step_s)
+    if iterations is not None:
+        host.opt.iterations, host.opt.ls_iterations = iterations
+    first = mujoco.MjData(host)
+    mujoco.mj_forward(host, first)
+    model = mjw.put_model(host)
+    data = mjw.put_data(host, first, nworld=environments, nconmax=32, njmax=160)
+    rng = np.random.default_rng(0)
+    qpos, qvel = (wp.array(np.tile(row, (environments, 1)), dtype=float) for row in (first.qpos, first.qvel))
+    mjw.step(model, data)  # compiles
+    with wp.ScopedCapture() as capture:
+        mjw.step(model, data)
+    steps, spent, touching = round(seconds / step_s), [], 0.0
+    for _ in range(REPEATS):
+        wp.copy(data.qpos, qpos)
+        wp.copy(data.qvel, qvel)
+        targets = [wp.array(wanted_angles(host, rng, environments), dtype=float) for _ in range(5)]
+        wp.synchronize()
+        began = time.perf_counter()
+        for k in range(steps):
+            if k % max(1, steps // 5) == 0:
+                wp.copy(data.ctrl, targets[min(k // max(1, steps // 5), 4)])
+            wp.capture_launch(capture.graph)
+        wp.synchronize()
+        spent.append(time.perf_counter() - began)
+        touching = float(data.nacon.numpy()[0]) / environments
+    return {
+        "mujoco_warp": getattr(mjw, "__version__", "?"), "environments": environments, "iterations": iterations,
+        "env_steps_a_s": environments * steps / sorted(spent)[len(spent) // 2], "contacts_at_the_end": touching,
+        "finite": bool(np.isfinite(data.qpos.numpy()).all()),
+    }  # fmt: skip
 
 
 def main() -> None:
@@ -187,9 +252,13 @@ def main() -> None:
             links = "without mass" if massless else "with mass"
             print(json.dumps({"links": links, "spheres": spheres, "lanes": lanes, **found}), flush=True)
     try:
-        print(json.dumps(mujoco_cost(arguments.urdf, arguments.seconds, arguments.step)))
+        print(json.dumps(mujoco_cost(arguments.urdf, arguments.seconds, arguments.step)), flush=True)
     except ImportError:
         print("mujoco is not installed")
+    if arguments.device == "cuda" and all(importlib.util.find_spec(name) for name in ("mujoco_warp", "warp")):
+        for environments, iterations in itertools.product((arguments.environments, 16_384), ((5, 8), None)):
+            found = warp_cost(arguments.urdf, environments, arguments.seconds, arguments.step, iterations)
+            print(json.dumps(found), flush=True)
 
 
 if __name__ == "__main__":
