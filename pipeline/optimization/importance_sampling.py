@@ -21,6 +21,8 @@ Costs = Callable[[Array], Array]
 
 _WIDENING = 1.5
 """Factor by which a proposal's covariance exceeds that of the weighted samples, so that tails are covered."""
+_RESAMPLED = 400
+"""Samples of the episodes from which the scatter of the mean is computed, known to 4 %."""
 _LEAST_STD = 0.03
 """Minimum standard deviation of a proposal, as a share of the prior's."""
 
@@ -47,10 +49,16 @@ class SearchResult:
     """Covariance (P, P) of the tempered posterior."""
     lowest: float
     """Lowest mean cost over episodes."""
+    prior: NormalPrior
+    """The prior."""
     samples: Array
     """All samples (N, P)."""
     costs: Array
     """Their costs (N, E) by episode."""
+    log_ratio: Array
+    """Logarithm (N,) of the prior's density over that of all proposals, up to a constant."""
+    sharpness: float
+    """Factor of the square of the mean cost in the negative logarithm of the likelihood, as flat as it became."""
     history: list[float]
     """Lowest mean cost after each generation."""
     effective_samples: float
@@ -91,6 +99,7 @@ def importance_search(
     samples, found = np.empty((0, size)), np.empty((0, 0))
     history: list[float] = []
     mean, covariance, effective = *proposals[0], 0.0
+    log_ratio, sharpness = np.zeros(0), 0.0
     for generation in range(generations):
         drawn = rng.multivariate_normal(*proposals[-1], population).clip(prior.bounds[:, 0], prior.bounds[:, 1])
         if generation == 0:
@@ -101,19 +110,24 @@ def importance_search(
         history.append(float(total.min()))
         if on_generation:
             on_generation(generation, history[-1])
+        log_ratio = _log_ratio(samples, prior, proposals)
         if not np.isfinite(history[-1]):
             continue
-        fit = -0.5 * (np.square(total) - history[-1] ** 2) / max(history[-1], floor) ** 2
-        log_ratio, least = _log_ratio(samples, prior, proposals), max(population / 4, 2.0 * size)
-        weight, effective = _weights(log_ratio, fit, errors, least)
+        scale, least = max(history[-1], floor), max(population / 4, 2.0 * size)
+        fit = -0.5 * (np.square(total) - history[-1] ** 2) / scale**2
+        weight, effective, resolved = _weights(log_ratio, fit, errors, least)
+        sharpness = 0.5 * resolved / scale**2
         mean, covariance = _moments(samples, weight)
         proposals.append((mean, _WIDENING * covariance + np.diag(np.square(_LEAST_STD * prior.std))))
     return SearchResult(
         mean=mean,
         covariance=covariance,
         lowest=history[-1],
+        prior=prior,
         samples=samples,
         costs=found,
+        log_ratio=log_ratio,
+        sharpness=sharpness,
         history=history,
         effective_samples=effective,
     )
@@ -135,11 +149,8 @@ def _log_ratio(samples: Array, prior: NormalPrior, proposals: list[tuple[Array, 
     return log_prior - np.logaddexp.reduce(np.array(logs), axis=0)
 
 
-def _weights(log_ratio: Array, fit: Array, errors: float, least: float) -> tuple[Array, float]:
-    """Return normalized weights (N,) and their effective number.
-
-    `errors` is reduced until the effective number reaches `least`.
-    """
+def _weights(log_ratio: Array, fit: Array, errors: float, least: float) -> tuple[Array, float, float]:
+    """Return normalized weights (N,), their effective number, and `errors`, reduced until this reaches `least`."""
     for _ in range(40):
         log_weight = log_ratio + errors * np.where(np.isfinite(fit), fit, -np.inf)
         weight = np.exp(log_weight - log_weight.max())
@@ -148,48 +159,33 @@ def _weights(log_ratio: Array, fit: Array, errors: float, least: float) -> tuple
         if effective >= min(least, len(weight) / 2):
             break
         errors *= 0.8
-    return weight, effective
+    return weight, effective, errors
 
 
-def episode_covariance(result: SearchResult, at: np.ndarray, minimum: int = 8) -> np.ndarray | None:
-    """Estimate the covariance (P, P) of the minimizer from the scatter between episodes.
+def episode_covariance(result: SearchResult, minimum: int = 8) -> Array | None:
+    """Estimate the covariance (P, P) of the error of the mean from the scatter between episodes.
 
-    A quadratic is fitted to every episode's cost over the samples nearest to `at`. With H the mean curvature and g the
-    episodes' slopes there, the covariance is H^-1 cov(g) H^-1 / E (the sandwich of an M-estimator; Huber 1967). The
-    derivatives are taken over the width of the sample cloud, where the cost is smooth, not at a point, where it is
-    rough.
+    Episodes are drawn anew with replacement, and the samples are weighed by their costs (the bootstrap; Efron 1979): so
+    far would other episodes have moved the mean. Where the data say little, the mean stays near the prior's whatever
+    the truth is. With C the posterior's covariance, the mean is off by C / S^2 of the distance between the truth and
+    the prior's mean, which has the prior's covariance S^2: that adds C / S^2 C, all of S^2 without data. As a mean of n
+    effective samples it is off by C / n more.
 
     Args:
         result: Result of the search.
-        at: The minimizer (P,).
         minimum: Minimum number of episodes.
 
     Returns:
-        The covariance; None for too few episodes or samples, or without curvature.
+        The covariance; None for too few episodes.
     """
-    episodes, size = result.costs.shape[1], len(at)
-    terms = 1 + size + size * (size + 1) // 2
+    count = result.costs.shape[1]
+    if count < minimum:
+        return None
+    drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), _RESAMPLED) / count
     finite = np.isfinite(result.costs).all(1)
-    samples, costs = result.samples[finite], result.costs[finite]
-    if episodes < minimum or len(samples) < 3 * terms:
-        return None
-    scale = samples.std(0) + 1e-12
-    offset = (samples - at) / scale
-    near = np.argsort(np.square(offset).sum(1), kind="stable")[: max(3 * terms, len(samples) // 3)]
-    x = offset[near]
-    upper = [(i, j) for i in range(size) for j in range(i, size)]
-    basis = np.column_stack([np.ones(len(x)), x, *(x[:, i] * x[:, j] for i, j in upper)])
-    solution = np.linalg.lstsq(basis, costs[near], rcond=None)[0]
-    slopes = solution[1 : 1 + size]
-    curvature = np.zeros((size, size))
-    for (i, j), value in zip(upper, solution[1 + size :].mean(1), strict=True):
-        curvature[i, j] += value
-        curvature[j, i] += value
-    eigenvalues, vectors = np.linalg.eigh(curvature)
-    if eigenvalues[-1] <= 0:
-        return None
-    # the data do not determine a direction without curvature: it gets the width of the search
-    floor = np.maximum(eigenvalues, 1e-3 * eigenvalues[-1])
-    inverse = vectors @ np.diag(1 / floor) @ vectors.T
-    covariance = inverse @ np.atleast_2d(np.cov(slopes)) @ inverse / episodes
-    return covariance * np.outer(scale, scale)
+    logs = result.log_ratio[finite, None] - result.sharpness * np.square(result.costs[finite] @ drawn.T)
+    weight = np.exp(logs - logs.max(0))
+    means = (weight / weight.sum(0)).T @ result.samples[finite]
+    scatter = np.atleast_2d(np.cov(means.T)) * count / (count - 1)
+    pulled = result.covariance / np.square(result.prior.std) @ result.covariance
+    return scatter + pulled + result.covariance / result.effective_samples

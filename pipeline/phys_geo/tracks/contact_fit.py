@@ -361,7 +361,7 @@ def _contact_estimate(
     """Return the contact parameters by the search, refined by shooting where there are few episodes."""
     search = search_contact(ready.world, batch, ready.start, data.noise, config, warm_started)
     record = replace(record, search_open_loop_m=search.history, search_effective_samples=search.effective_samples)
-    covariance = episode_covariance(search, search.mean, ENOUGH_EPISODES)
+    covariance = episode_covariance(search, ENOUGH_EPISODES)
     if covariance is not None:
         return ContactEstimate(parameters=ready.parameters, values=search.mean, covariance=covariance), record
     episodes = ShootingEpisodes(episodes=data.searched, spans=data.spans, batch=batch)

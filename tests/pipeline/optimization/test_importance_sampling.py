@@ -85,12 +85,13 @@ def test_samples_are_weighed_against_the_mixture_of_all_proposals() -> None:
 
 def test_the_likelihood_is_flattened_until_enough_samples_count() -> None:
     fit = np.array([0.0, -1.0, -3.0, -np.inf, np.nan])
-    weight, effective = _weights(np.zeros(5), fit, 2.0, 1.0)
+    weight, effective, resolved = _weights(np.zeros(5), fit, 2.0, 1.0)
     np.testing.assert_allclose(weight, np.exp([0.0, -2.0, -6.0, -np.inf, -np.inf]) / (1 + np.exp(-2) + np.exp(-6)))
-    assert effective == pytest.approx(1 / (weight**2).sum())
-    flat, more = _weights(np.zeros(5), fit, 2.0, 2.4)
+    assert effective == pytest.approx(1 / (weight**2).sum()) and resolved == 2.0
+    flat, more, errors = _weights(np.zeros(5), fit, 2.0, 2.4)
     assert more >= 2.4 > effective and flat.sum() == pytest.approx(1.0)
-    steps = np.log(-np.log(flat[1] / flat[0]) / 2.0) / np.log(0.8)
+    assert -np.log(flat[1] / flat[0]) == pytest.approx(errors)
+    steps = np.log(errors / 2.0) / np.log(0.8)
     assert steps == pytest.approx(round(steps)) and steps >= 1  # by fifths
     half = _weights(np.zeros(4), np.array([0.0, -9.0, -9.0, -9.0]), 1.0, 100.0)[1]
     assert half >= 2.0  # never more than half of them
@@ -103,40 +104,64 @@ def test_moments_are_those_of_the_weights() -> None:
     np.testing.assert_allclose(covariance, np.cov(samples.T, aweights=weight, ddof=0))
 
 
-def scattered(episodes: int, stiff: np.ndarray, count: int = 90) -> tuple[SearchResult, np.ndarray]:
-    """Return samples with the costs of episodes that are quadratic about minimizers of their own, and these."""
-    rng = np.random.default_rng(3)
-    samples, places = rng.normal(0, (1.0, 0.2), (count, 2)), rng.normal(0, (0.1, 0.03), (episodes, 2))
-    away = samples[:, None] - places
-    quadratic = 1.0 + 0.5 * np.einsum("kep,pq,keq->ke", away, stiff, away)
-    quadratic[0] = np.nan  # the model diverged
-    nothing = {"mean": places.mean(0), "covariance": np.eye(2), "lowest": 1.0, "history": [], "effective_samples": 1.0}
-    return SearchResult(samples=samples, costs=quadratic, **nothing), places
+def scattered(stiff: np.ndarray, episodes: int = 30, spread: float = 0.5) -> tuple[SearchResult, np.ndarray]:
+    """Return a search among episodes whose costs are quadratic about minimizers of their own, and these."""
+    places = PLACE + spread * np.random.default_rng(3).normal(size=(episodes, 2))
+
+    def own(samples: np.ndarray) -> np.ndarray:
+        away = samples[:, None] - places
+        found = 1.0 + 0.05 * np.einsum("kep,pq,keq->ke", away, stiff, away)
+        found[7, 0] = np.nan  # the model diverged
+        return found
+
+    found = importance_search(own, PRIOR, seed=1, population=500, generations=5, errors=3.0 * episodes, floor=0.0)
+    return found, places
 
 
-def test_the_minimizers_covariance_is_that_of_the_mean_of_the_episodes_own() -> None:
-    result, places = scattered(9, STIFF)
-    found = episode_covariance(result, places.mean(0))
-    np.testing.assert_allclose(found, np.cov(places.T) / 9, rtol=1e-6)
-
-
-def test_a_direction_without_curvature_is_as_wide_as_the_search_allows() -> None:
-    result, places = scattered(9, np.diag([4.0, 0.0]))
-    result.costs[:, 0] += 0.3 * result.samples[:, 1]  # one episode pulls along it
-    found = episode_covariance(result, places.mean(0))
+def test_the_means_covariance_is_that_of_the_episodes_minimizers_where_these_tell_it() -> None:
+    result, places = scattered(100 * STIFF)
+    found = episode_covariance(result)
     assert found is not None
-    steep = 4.0 * np.nanstd(result.samples[1:, 0]) ** 2
-    slope = 0.3 * np.nanstd(result.samples[1:, 1])
-    scale = np.nanstd(result.samples[1:, 1])
-    assert found[0, 0] == pytest.approx(np.cov(places.T)[0, 0] / 9, rel=1e-6)
-    assert found[1, 1] == pytest.approx((slope * scale / (1e-3 * steep)) ** 2 / 9 / 9, rel=1e-6)
+    np.testing.assert_allclose(result.mean, places.mean(0), atol=0.02)
+    wanted = np.cov(places.T) / len(places)
+    std = np.sqrt(wanted.diagonal())
+    np.testing.assert_allclose(found / np.outer(std, std), wanted / np.outer(std, std), atol=0.15)
 
 
-def test_few_episodes_few_samples_and_a_maximum_have_no_covariance() -> None:
-    assert episode_covariance(*scattered(7, STIFF)[:1], np.zeros(2)) is None
-    assert episode_covariance(scattered(8, STIFF, 18)[0], np.zeros(2)) is None  # 17 are finite; three times six needed
-    assert episode_covariance(scattered(8, STIFF, 19)[0], np.zeros(2)) is not None
-    assert episode_covariance(scattered(9, -STIFF)[0], np.zeros(2)) is None
+@pytest.mark.parametrize("slope", [0.0, 0.05])
+def test_what_the_costs_do_not_show_is_as_unknown_as_before(slope: float) -> None:
+    """One episode's slope of a twentieth of its cost along it makes it no worse known, nor the other number."""
+    result, places = scattered(np.diag([300.0, 0.0]))
+    result.costs[:, 5] += slope * result.samples[:, 1]
+    found = episode_covariance(result)
+    assert found is not None
+    assert found[0, 0] == pytest.approx(np.var(places[:, 0], ddof=1) / len(places), rel=0.2)
+    assert found[1, 1] == pytest.approx(PRIOR.std[1] ** 2, rel=0.15)
+
+
+def test_the_covariance_is_that_of_the_errors_of_repeated_searches_with_a_truth_from_the_prior() -> None:
+    """Half known: the mean lies between what the episodes say and the prior's mean."""
+    rng, errors, claimed = np.random.default_rng(0), [], []
+    prior = NormalPrior(np.zeros(1), np.ones(1), np.array([[-9.0, 9.0]]))
+    for seed in range(100):
+        truth = rng.normal()
+        places = truth + 3.0 * rng.normal(size=12)
+        result = importance_search(
+            lambda samples, places=places: 3.0 + 0.012 * np.square(samples - places),
+            prior, seed=seed, population=200, generations=1, errors=36.0, floor=0.0,
+        )  # fmt: skip
+        found = episode_covariance(result)
+        assert found is not None
+        errors.append(result.mean[0] - truth)
+        claimed.append(found[0, 0])
+    assert 0.4 < np.mean(np.square(errors)) < 0.9
+    assert np.mean(claimed) == pytest.approx(np.mean(np.square(errors)), rel=0.25)
+
+
+def test_few_episodes_have_no_covariance() -> None:
+    result, _ = scattered(STIFF, 8)
+    assert episode_covariance(result) is not None
+    assert episode_covariance(result, minimum=9) is None
 
 
 def test_proposals_are_wider_than_the_samples_and_never_narrow(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,12 +7,7 @@ import pytest
 import torch
 from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
-from cgwm.pipeline.optimization.importance_sampling import (
-    NormalPrior,
-    SearchResult,
-    episode_covariance,
-    importance_search,
-)
+from cgwm.pipeline.optimization.importance_sampling import NormalPrior, importance_search
 from cgwm.pipeline.optimization.levenberg_marquardt import minimise
 from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_fit import NEVER_TOUCHES, fit_physics
@@ -108,26 +103,6 @@ def test_search_gives_the_posterior_of_a_linear_model() -> None:
     np.testing.assert_allclose(found.mean, expected, atol=0.03)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(precision), rtol=0.15, atol=1e-3)
     assert found.effective_samples > 400
-
-
-def test_covariance_from_the_scatter_between_episodes_is_that_of_the_mean() -> None:
-    """Cost of episode i is (z - c_i)^2: the minimiser is the mean of c, with variance var(c) / n."""
-    rng = np.random.default_rng(0)
-    centres = 1 + 0.3 * rng.standard_normal(40)
-    samples = rng.normal(centres.mean(), 0.3, (200, 1))
-    result = SearchResult(
-        mean=centres.mean(keepdims=True),
-        covariance=np.eye(1),
-        lowest=0.0,
-        samples=samples,
-        costs=(samples - centres) ** 2,
-        history=[],
-        effective_samples=200.0,
-    )
-    covariance = episode_covariance(result, centres.mean(keepdims=True))
-    assert covariance is not None
-    assert covariance[0, 0] == pytest.approx(centres.var(ddof=1) / 40, rel=1e-3)
-    assert episode_covariance(result, centres.mean(keepdims=True), minimum=41) is None
 
 
 def test_the_warm_up_ends_at_the_first_contact_and_its_state_is_unbiased() -> None:
