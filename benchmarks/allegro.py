@@ -35,6 +35,7 @@ from cgwm.pipeline.control.hand_plant import HandScenePlant
 from cgwm.pipeline.runtime.resources import no_garbage_search
 from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
 from cgwm.schemas import ContactParameters, HandTask
+from compared_solvers import ComparedSolvers, Note, solvers_of
 from known_object import SPREAD, errors_of, known_object, sensing_of
 from plant_process import PipedPlant
 from store import Store
@@ -129,14 +130,17 @@ def task_of(folder: Path, scene: Path, seed: int, given: argparse.Namespace) -> 
 
 
 def measure(
-    folder: Path, scene: Path, seed: int, given: argparse.Namespace, piped: PipedPlant | None
+    folder: Path, scene: Path, seed: int, given: argparse.Namespace, piped: PipedPlant | None, note: Note
 ) -> dict[str, Any]:
-    """Return the figures of one run."""
+    """Return the figures of one run; `note` takes comparisons of solvers."""
     task = task_of(folder, scene, seed, given)
     # some starts overlap with the thumb, and the wanted place with the fingers at the start: a task may ask neither
     above = task.start.model_copy(update={"position_m": (*task.start.position_m[:2], ABOVE_M)})
     model = model_of(scene, given.corners, SPREAD if given.draws else 0.0)
-    controller = HandController(model, task.model_copy(update={"start": above}), draws=given.draws)
+    solver = "mppi" if given.solver == "compared" else given.solver
+    controller = HandController(model, task.model_copy(update={"start": above}), solver, draws=given.draws)
+    if given.solver == "compared":
+        controller._solver = ComparedSolvers(solvers_of(given.samples), note)
     goal = task.goal.model_copy(update={"position_m": PLACES[scene.stem.removeprefix("env_allegro_")][1]})
     controller.task = task.model_copy(update={"goal": goal})
     controller.hand = replace(controller.hand, task=controller.task)
@@ -159,7 +163,8 @@ def rows(store: Store) -> Iterator[list[str]]:
     """Yield the rows of the table."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in store.results():
-        found.setdefault(row["key"].rpartition("/")[0], []).append(row)
+        if "ended" in row:
+            found.setdefault(row["key"].rpartition("/")[0], []).append(row)
     for name, runs in sorted(found.items()):
         good = [run for run in runs if run["ended"] == "success"]
         middle = [f"{np.median([run[key] for run in good]):.1f}" if good else "" for key in
@@ -190,6 +195,10 @@ def main() -> None:
     parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
     parser.add_argument("--draws", type=int, default=0, help="of friction, whose standard error is 70 %% then")
     parser.add_argument("--lift", type=float, default=0.0, help="height above the start of the repository [m]")
+    parser.add_argument(
+        "--solver", choices=("mppi", "both", "gauss-newton", "compared"), default="mppi",
+        help="compared: the plans of mppi, and what the others make of some of them",
+    )  # fmt: skip
     parser.add_argument("--mujoco", type=Path, default=None, help="packages of the plant's own process")
     parser.add_argument("--store", type=Path, default=None)
     parser.add_argument("--any-commit", action="store_true", help="results of other commits count")
@@ -211,7 +220,13 @@ def main() -> None:
                 size += f", {given.plant}" if given.plant else ""
                 size += f", {given.draws} draws" if given.draws else ""
                 size += f", {given.mujoco.name}" if given.mujoco else ""
-                store.result(f"{thing}, {size}/{seed}", lambda c=scene, s=seed: measure(folder, c, s, given, piped))
+                size += "" if given.solver == "mppi" else f", {given.solver}"
+                key = f"{thing}, {size}/{seed}"
+
+                def note(plan: int, figures: dict[str, Any], key: str = key) -> None:
+                    store.add(f"{key}, plan {plan}", figures)
+
+                store.result(key, lambda c=scene, s=seed, n=note: measure(folder, c, s, given, piped, n))
     if piped is not None:
         piped.close()
 

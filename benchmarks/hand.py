@@ -10,7 +10,8 @@ of google-deepmind/mujoco_menagerie's leap_hand, of which only `tip` and `thumb_
 scene. A goal counts within 0.4 rad; a run ends at 20 goals, a drop, after 80 s without a goal, or at its length.
 Clocks: real charges each plan its wall time, cpu the time of all processors (what one idle core would need), ideal
 nothing. Contenders: mppi, both, gauss-newton; `hold` never moves: what the goals give by chance; `cem`: see
-`hand_cem.py`, with compute for free (`--clock ideal --hz 20`). A run that reaches the limit of wall time is "cut". For
+`hand_cem.py`, with compute for free (`--clock ideal --hz 20`); `compared`: as mppi, and what the other solvers make of
+some of its plans, a row for each. A run that reaches the limit of wall time is "cut". For
 a real clock on some cores of a machine: `taskset -c`, one process each.
 """
 
@@ -39,6 +40,7 @@ from cgwm.pipeline.control.horizon import Array
 from cgwm.pipeline.control.solvers import Solution
 from cgwm.pipeline.runtime.resources import no_garbage_search
 from cgwm.schemas import ContactParameters, HandTask, NotConvergedError
+from compared_solvers import ComparedSolvers, solvers_of
 from hand_cem import CemController
 from known_object import SPREAD, errors_of, known_object, sensing_of
 from numpy.typing import ArrayLike
@@ -176,11 +178,15 @@ def measure(
     if name == "cem":
         controller = CemController(model, task)
     else:
-        solver = "mppi" if name == "hold" else name
+        solver = "mppi" if name in ("hold", "compared") else name
         extra: Any = {"draws": given.draws, "device": device}
         controller = HandController(model, task, solver, **extra)  # pyright: ignore[reportArgumentType]
     if name == "hold":
         controller._solver = Hold()
+    if name == "compared":
+        controller._solver = ComparedSolvers(
+            solvers_of(given.samples), lambda plan, figures: note({"plan": plan} | figures)
+        )
     if clock == "cpu":
         charge_processors(controller)
     before = os.getloadavg()[0]
