@@ -1,6 +1,6 @@
 """Losses in passive joints from tracks: a door that swings and a drawer that a finger pushes, simulated by MuJoCo.
 
-    python benchmarks/joints.py FOLDER [--episodes N]
+    python benchmarks/joints.py FOLDER [--episodes N] [--seed N] [--only door|drawer]
 
 The captures are made in FOLDER, with noise of 0.2 mm and 1 mrad, and fitted by `cgwm fit`. The door hangs on a hinge
 with a level axis and touches nothing; the finger moves at a speed of its own in each episode, and carries the force
@@ -147,13 +147,17 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--episodes", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=("door", "drawer"), help="fit one of the two alone")
     given = parser.parse_args()
     rng = np.random.default_rng(given.seed)
     for name, body, urdf, motion, joint, truth in (
         ("door", "", DOOR_URDF, door, "hinge", HINGE),
         ("drawer", FINGER, DRAWER_URDF, drawer, "rail", RAIL),
     ):
-        made = capture(given.folder / name, body, urdf, [motion(rng) for _ in range(given.episodes)])
+        motions = [motion(rng) for _ in range(given.episodes)]  # of both, so that seeds give the same ones
+        if given.only not in (None, name):
+            continue
+        made = capture(given.folder / name, body, urdf, motions)
         fit(made, given.folder / f"{name}_model", overwrite=True)
         fitted = {p.name: p for p in read_model(given.folder / f"{name}_model").file.parameters}
         for key, value in {f"{joint}.{number}": value for number, value in truth.items()}.items():

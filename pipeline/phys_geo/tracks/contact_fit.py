@@ -363,7 +363,10 @@ def _contact_estimate(
     record = replace(record, search_open_loop_m=search.history, search_effective_samples=search.effective_samples)
     covariance = episode_covariance(search, ENOUGH_EPISODES)
     if covariance is not None:
-        return ContactEstimate(parameters=ready.parameters, values=search.mean, covariance=covariance), record
+        estimate = ContactEstimate(
+            parameters=ready.parameters, values=search.mean, covariance=covariance, spread=search.covariance
+        )
+        return estimate, record
     episodes = ShootingEpisodes(episodes=data.searched, spans=data.spans, batch=batch)
     estimate, shooting = shoot_contact(
         ready.world, episodes, search, ready.parameters, ready.ground_known, data.noise, config

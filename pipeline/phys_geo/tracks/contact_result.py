@@ -43,6 +43,9 @@ class ContactEstimate:
     """Estimate, shape (P,)."""
     covariance: np.ndarray
     """Covariance of the estimate, shape (P, P)."""
+    spread: np.ndarray | None = None
+    """Covariance of all parameters that predict the motion about equally well, shape (P, P), from a search; None where
+    `covariance` is that, too."""
     starts: dict[str, tuple[float, State]] = field(default_factory=dict)
     """Time [s] and state of the first frame of each episode, by its name, where shooting found it."""
     bounces: BounceDamping | None = None
@@ -54,13 +57,18 @@ class ContactEstimate:
 def with_damping(estimate: ContactEstimate, damping: BounceDamping) -> ContactEstimate:
     """Return an estimate of the other contact parameters, completed by a damping ratio of its own."""
     place = CONTACT_PARAMETERS.index(DAMPING_RATIO)
-    covariance = np.insert(np.insert(estimate.covariance, place, 0.0, 0), place, 0.0, 1)
-    covariance[place, place] = damping.variance
+
+    def with_variance(covariance: np.ndarray) -> np.ndarray:
+        wider = np.insert(np.insert(covariance, place, 0.0, 0), place, 0.0, 1)
+        wider[place, place] = damping.variance
+        return wider
+
     return replace(
         estimate,
         parameters=[*estimate.parameters[:place], DAMPING_RATIO, *estimate.parameters[place:]],
         values=np.insert(estimate.values, place, damping.value),
-        covariance=covariance,
+        covariance=with_variance(estimate.covariance),
+        spread=None if estimate.spread is None else with_variance(estimate.spread),
         bounces=damping,
     )
 

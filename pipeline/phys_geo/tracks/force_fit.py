@@ -9,17 +9,28 @@ The force also depends on where the pusher touches, and so on the start of each 
 their noise alone: the starts are estimated with the parameters, with what the first frames say of them as their prior,
 and eliminated from the information.
 
+The forces of short intervals have minima far from the truth, where contact sets in or ends at another time than was
+measured. So the descent begins with mean forces on long intervals: what contact exchanges there follows from the change
+of momentum, whatever its law. From their minimum the short intervals go on. Where the two differ by more than chance
+(Hausman, 1978), contact does not follow its law: the estimate is that of the long intervals, and its interval holds
+both.
+
+The estimate of a search of many episodes counts with the spread of all samples that predict the motion about as well:
+the scatter between episodes gives each parameter's error, but its inverse claims combinations of parameters to be known
+a thousand times better than these samples show, where the motion hardly depends on them.
+
 Forces that the model does not explain to within their noise count less: the information is divided by the misfit and,
 because errors of the model last, by the number of successive residuals that go together, (1 + r) / (1 - r) for the
 correlation r of neighbours (of a first-order autoregression; Bayley and Hammersley, 1946). With many episodes their
 scatter counts, too: a standard error is at least that by the scores of whole episodes (the sandwich; White, 1982), so
-that a friction that differs from push to push widens the interval.
+that a friction that differs from push to push widens the interval. Forces of which the model explains less than half
+are not used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +70,12 @@ MEDIAN_CHI2 = 2.366
 """Median of chi-square with 3 degrees of freedom."""
 MANY_EPISODES = 8
 """Number of episodes from which on their scatter counts."""
+MOST_UNEXPLAINED = 0.5
+"""Largest typical difference of the model's forces from the measured ones, relative to these, with which they are
+used."""
+APART, LEAST_APART = 3.84, 0.1
+"""Squared difference of the estimates by long and by short intervals that is chance, in units of its variance: 95 % of
+a chi-square; and the least such variance, as a share of that by long intervals."""
 
 
 def with_forces(
@@ -77,21 +94,84 @@ def with_forces(
         observations: The episodes (E), with the states at their first frames.
         start_cov: Covariance (E, 12 nf, 12 nf) of these states.
     """
-    residuals = ForceResiduals(world, estimate.parameters, forces, observations, start_cov)
-    problem, point, converged = _descended(_ForceProblem(residuals, estimate))
-    at_end = problem.residuals_at(point)
-    misfit = _misfit(at_end)
-    problem = problem.scaled(max(1.0, misfit), residuals.repeats(at_end, MOST_CORRELATION))
-    by_item = problem.linearised(point, Rows.of(problem.owner, 1)).eliminated()
+    wide = estimate if estimate.spread is None else replace(estimate, covariance=estimate.spread)
+
+    def told(some: Sequence[MeasuredForce], start: Point | None) -> _Told:
+        return _told(ForceResiduals(world, estimate.parameters, some, observations, start_cov), wide, start)
+
+    slow = told([force.slow() for force in forces], None)
+    fast = told(forces, slow.point)
+    excess = _excess(slow, fast)
     record = {
         "episodes": len({force.episode.name for force in forces}),
         "intervals": sum(len(force.force_n) for force in forces),
         "std_n": float(np.median([force.std_n for force in forces])),
-        "misfit": misfit,
-        "information_over": problem.scale * problem.repeats,
-        "converged": converged,
+        "misfit": fast.misfit,
+        "information_over": fast.problem.scale * fast.problem.repeats,
+        "converged": fast.converged,
+        "long_intervals": {
+            "intervals": sum(len(force.slow().force_n) for force in forces),
+            "misfit": slow.misfit,
+            "information_over": slow.problem.scale * slow.problem.repeats,
+            "converged": slow.converged,
+        },
+        "unexplained": slow.unexplained,
+        "used": slow.unexplained <= MOST_UNEXPLAINED,
+        "apart": [p.name for p, beyond in zip(estimate.parameters, excess, strict=True) if beyond > 0],
     }
-    return replace(estimate, values=point.values[0].numpy(), covariance=_covariance(by_item)), record
+    if not record["used"]:
+        return estimate, record
+    values, covariance = (slow.values, slow.covariance + np.diag(excess)) if excess.any() else (
+        fast.values, fast.covariance)  # fmt: skip
+    return replace(estimate, values=values, covariance=covariance, spread=None), record
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Told:
+    """What forces on intervals of one length say."""
+
+    point: Point
+    """The minimum."""
+    covariance: NDArray[np.float64]
+    """Covariance of the parameters, shape (P, P)."""
+    problem: _ForceProblem
+    """The problem, with the scale and the repeats of that minimum."""
+    misfit: float
+    """Median chi-square of an interval, relative to its expectation."""
+    unexplained: float
+    """Typical difference of the model's forces from the measured ones, relative to these."""
+    converged: bool
+    """Whether the minimum was found."""
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Estimate, shape (P,)."""
+        return self.point.values[0].numpy()
+
+
+def _told(residuals: ForceResiduals, estimate: ContactEstimate, start: Point | None) -> _Told:
+    """Return what forces say beside an estimate, from its descent or from that of another start."""
+    problem = _ForceProblem(residuals, estimate)
+    problem, point, converged = _descended(problem, start or problem.start())
+    at_end = problem.residuals_at(point)
+    misfit = _misfit(at_end)
+    problem = problem.scaled(max(1.0, misfit), residuals.repeats(at_end, MOST_CORRELATION))
+    by_item = problem.linearised(point, Rows.of(problem.owner, 1)).eliminated()
+    return _Told(
+        point=point,
+        covariance=_covariance(by_item),
+        problem=problem,
+        misfit=misfit,
+        unexplained=residuals.unexplained(at_end),
+        converged=converged,
+    )
+
+
+def _excess(slow: _Told, fast: _Told) -> NDArray[np.float64]:
+    """Return the squared difference (P,) of two estimates beyond chance, of which the second knows more."""
+    before, after = np.diag(slow.covariance), np.diag(fast.covariance)
+    expected = np.maximum(before - after, LEAST_APART * before)
+    return np.maximum(np.square(fast.values - slow.values) - APART * expected, 0.0)
 
 
 class _ForceProblem(Problem):
@@ -183,9 +263,8 @@ class _ForceProblem(Problem):
         )
 
 
-def _descended(problem: _ForceProblem) -> tuple[_ForceProblem, Point, bool]:
-    """Return the problem at the misfit of its minimum, the minimum, and whether it was found."""
-    point = problem.start()
+def _descended(problem: _ForceProblem, point: Point) -> tuple[_ForceProblem, Point, bool]:
+    """Return the problem at the misfit of its minimum, the minimum from a start, and whether it was found."""
     problem = problem.scaled(max(1.0, _misfit(problem.residuals_at(point))))
     for _ in range(ROUNDS):
         descent = descend(problem, point, POLICY)

@@ -21,7 +21,12 @@ from .measured_forces import MeasuredForce
 STEP = 0.1
 """Step of the differences by a parameter or a start, in standard deviations of its prior."""
 LEAST_SHARE = 1e-6
-"""Least eigenvalue of the correlations of a start that is varied [1]."""
+"""Least eigenvalue of the correlations of a start that is varied [1], and least part of the largest change of a state
+that an axis makes where links keep to their joints."""
+TOUCHES = 5.0
+"""Size of a mean force, in standard deviations of a component, from which on it counts as one."""
+NEAR = 1e-3
+"""Step of the differences that show this, in standard deviations."""
 
 
 class ForceResiduals:
@@ -49,7 +54,7 @@ class ForceResiduals:
         self.world, self.parameters, self.observations = world, parameters, observations
         rows = list(dict.fromkeys(force.row for force in forces))
         self.forces = [[force for force in forces if force.row == row] for row in rows]
-        roots = [_root(start_cov[row]) for row in rows]
+        roots = [self._on_joints(row, _root(start_cov[row])) for row in rows]
         self.start_size = max(root.shape[1] for root in roots)
         self.roots = [torch.nn.functional.pad(root, (0, self.start_size - root.shape[1])) for root in roots]
 
@@ -90,6 +95,34 @@ class ForceResiduals:
                 size += float(part.square().sum())
         correlation = min(max(ahead / max(size, 1e-30), 0.0), most)
         return (1 + correlation) / (1 - correlation)
+
+    def unexplained(self, residuals: Sequence[Tensor]) -> float:
+        """Return how far forces are from the measured ones, relative to these, in the middle of all that touch.
+
+        Args:
+            residuals: The residuals of each episode (N, 3).
+        """
+        off, size = [torch.zeros(0)], [torch.zeros(0)]
+        for group, every in zip(self.forces, residuals, strict=True):
+            for force, part in zip(group, every.split([len(force.force_n) for force in group]), strict=True):
+                exerted = torch.as_tensor(force.force_n).norm(dim=1)
+                touches = exerted > TOUCHES * force.std_n
+                off.append((part.norm(dim=1) * torch.as_tensor(force.spread_n))[touches])
+                size.append(exerted[touches])
+        every = torch.cat(size)
+        return float(torch.cat(off).median() / every.median()) if len(every) else 0.0
+
+    def _on_joints(self, row: int, root: Tensor) -> Tensor:
+        """Return the axes (12 nf, S) of a start without those that joints do not admit, in place of a root of it."""
+        if not self.world.chains:
+            return root
+        moves = NEAR * torch.cat((torch.eye(root.shape[1]), -torch.eye(root.shape[1]))).to(root)
+        start = self.observations.select([row]).state.repeat(len(moves))
+        with torch.no_grad():
+            states = on_joints(self.world, retract(start, moves @ root.T, self.observations.free))
+        ahead, behind = torch.cat([value.flatten(1) for value in states.tensors], 1).chunk(2)
+        _, sizes, axes = torch.linalg.svd((ahead - behind).T, full_matrices=False)
+        return root @ axes[sizes > LEAST_SHARE * sizes.amax()].T
 
     def _exerted(self, force: MeasuredForce, values: Tensor, changes: Tensor) -> Tensor:
         """Return the mean forces (K, intervals, 3) [N] that the driven body exerts in rollouts.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from ...trajectories.observations import Observations
 
 MOST_INTERVALS = 200
 """Maximum number of intervals of an episode; of more samples, several are averaged."""
+SLOW_INTERVALS = 10
+"""Maximum number of long intervals of an episode. A hit and the rebounds after it end within one or two of them, so
+that mean forces are smooth functions of friction, of losses in joints and of the law of the contact."""
 NOISY_CHANGE = 4.0
 """Largest squared change of a force from interval to interval, relative to its expectation from the noise alone, that
 counts as noise."""
@@ -55,6 +58,25 @@ class MeasuredForce:
             force_n=means,
             std_n=std,
             spread_n=np.hypot(std, _jumps(np.concatenate([force[:1], means, force[-1:]]), std)),
+        )
+
+    def slow(self, most: int = SLOW_INTERVALS) -> MeasuredForce:
+        """Return the mean forces on longer intervals, at most `most`; itself where it has no more.
+
+        What contact exchanges on a long interval follows from the change of momentum, whatever the law of contact.
+        """
+        each = -(-len(self.force_n) // most)
+        count = len(self.force_n) // each
+        if each == 1:
+            return self
+        means = self.force_n[: count * each].reshape(count, each, 3).mean(1)
+        std = self.std_n / float(np.sqrt(each))
+        return replace(
+            self,
+            edges_s=self.edges_s[: count * each + 1 : each],
+            force_n=means,
+            std_n=std,
+            spread_n=np.hypot(std, _jumps(np.concatenate([means[:1], means, means[-1:]]), std)),
         )
 
 
