@@ -15,6 +15,9 @@ of momentum, whatever its law. From their minimum the short intervals go on. Whe
 (Hausman, 1978), contact does not follow its law: the estimate is that of the long intervals, and its interval holds
 both.
 
+Losses in joints are known to decades before. Descents begin at what the forces ask for (`loss_start.py`), too, and
+where they end in two minima that are both probable, the interval holds both.
+
 The estimate of a search of many episodes counts with the spread of all samples that predict the motion about as well:
 the scatter between episodes gives each parameter's error, but its inverse claims combinations of parameters to be known
 a thousand times better than these samples show, where the motion hardly depends on them.
@@ -45,6 +48,7 @@ from ...physics.world import World
 from ...trajectories.observations import Observations
 from .contact_result import ContactEstimate
 from .force_residuals import ForceResiduals
+from .loss_start import loss_start
 from .measured_forces import MeasuredForce
 
 ROBUST_SCALE = 4.0
@@ -70,6 +74,8 @@ MEDIAN_CHI2 = 2.366
 """Median of chi-square with 3 degrees of freedom."""
 MANY_EPISODES = 8
 """Number of episodes from which on their scatter counts."""
+LEAST_POSTERIOR = 1e-3
+"""Least share of the posterior, relative to that of the best minimum, with which another one widens intervals."""
 MOST_UNEXPLAINED = 0.5
 """Largest typical difference of the model's forces from the measured ones, relative to these, with which they are
 used."""
@@ -96,11 +102,13 @@ def with_forces(
     """
     wide = estimate if estimate.spread is None else replace(estimate, covariance=estimate.spread)
 
-    def told(some: Sequence[MeasuredForce], start: Point | None) -> _Told:
-        return _told(ForceResiduals(world, estimate.parameters, some, observations, start_cov), wide, start)
-
-    slow = told([force.slow() for force in forces], None)
-    fast = told(forces, slow.point)
+    long = ForceResiduals(world, estimate.parameters, [force.slow() for force in forces], observations, start_cov)
+    short = ForceResiduals(world, estimate.parameters, forces, observations, start_cov)
+    first = _ForceProblem(long, wide).start()
+    losses = loss_start(long, wide, ROBUST_SCALE)
+    starts = [first] if losses is None else [first, replace(first, values=torch.as_tensor(losses)[None])]
+    slow = _told(long, wide, starts)
+    fast = _told(short, wide, slow.points)
     excess = _excess(slow, fast)
     record = {
         "episodes": len({force.episode.name for force in forces}),
@@ -130,8 +138,8 @@ def with_forces(
 class _Told:
     """What forces on intervals of one length say."""
 
-    point: Point
-    """The minimum."""
+    points: Sequence[Point]
+    """The minima that count, the best one first."""
     covariance: NDArray[np.float64]
     """Covariance of the parameters, shape (P, P)."""
     problem: _ForceProblem
@@ -146,25 +154,64 @@ class _Told:
     @property
     def values(self) -> NDArray[np.float64]:
         """Estimate, shape (P,)."""
-        return self.point.values[0].numpy()
+        return self.points[0].values[0].numpy()
 
 
-def _told(residuals: ForceResiduals, estimate: ContactEstimate, start: Point | None) -> _Told:
-    """Return what forces say beside an estimate, from its descent or from that of another start."""
-    problem = _ForceProblem(residuals, estimate)
-    problem, point, converged = _descended(problem, start or problem.start())
+def _told(residuals: ForceResiduals, estimate: ContactEstimate, starts: Sequence[Point]) -> _Told:
+    """Return what forces say beside an estimate, from descents from several starts."""
+    alone = _ForceProblem(residuals, estimate)
+    ends = [_descended(alone, start) for start in starts]
+    alone = alone.scaled(min(problem.scale for problem, _, _ in ends))
+    ends = sorted(ends, key=lambda end: alone.cost(end[1]))
+    problem, point, converged = ends[0]
     at_end = problem.residuals_at(point)
     misfit = _misfit(at_end)
     problem = problem.scaled(max(1.0, misfit), residuals.repeats(at_end, MOST_CORRELATION))
-    by_item = problem.linearised(point, Rows.of(problem.owner, 1)).eliminated()
+    modes = _modes(problem, [end[1] for end in ends])
     return _Told(
-        point=point,
-        covariance=_covariance(by_item),
+        points=[point for point, _, _ in modes],
+        covariance=_mixed(modes),
         problem=problem,
         misfit=misfit,
         unexplained=residuals.unexplained(at_end),
         converged=converged,
     )
+
+
+_Mode = tuple[Point, NDArray[np.float64], float]
+"""A minimum, the covariance (P, P) of its parameters, and its share of the posterior, relative to the first one's."""
+
+
+def _modes(problem: _ForceProblem, points: Sequence[Point]) -> list[_Mode]:
+    """Return those of the minima that differ, and whose share of the posterior counts; the first one in any case."""
+    found: list[_Mode] = []
+    for point in points:
+        if any(_same(point, other, covariance) for other, covariance, _ in found):
+            continue
+        covariance = _covariance(problem.linearised(point, Rows.of(problem.owner, 1)).eliminated())
+        share = 1.0
+        if found:
+            wider = 0.5 * (np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(found[0][1])[1])
+            share = float(np.exp(min(wider - 0.5 * (problem.cost(point) - problem.cost(found[0][0])), 0.0)))
+        if share > LEAST_POSTERIOR:
+            found.append((point, covariance, share))
+    return found
+
+
+def _same(one: Point, other: Point, covariance: NDArray[np.float64]) -> bool:
+    """Return whether two minima have the same parameters to within half a standard error."""
+    apart = (one.values - other.values)[0].numpy()
+    return bool((np.abs(apart) <= 0.5 * np.sqrt(np.diag(covariance))).all())
+
+
+def _mixed(modes: Sequence[_Mode]) -> NDArray[np.float64]:
+    """Return the covariance (P, P) about the first of several minima: of all of them, by their shares."""
+    total, middle = sum(share for _, _, share in modes), modes[0][0].values[0].numpy()
+    parts = []
+    for point, covariance, share in modes:
+        off = point.values[0].numpy() - middle
+        parts.append(share / total * (covariance + np.outer(off, off)))
+    return np.sum(parts, 0)
 
 
 def _excess(slow: _Told, fast: _Told) -> NDArray[np.float64]:
@@ -197,6 +244,10 @@ class _ForceProblem(Problem):
     def scaled(self, scale: float, repeats: float = 1.0) -> _ForceProblem:
         """Return the problem with another scale and number of residuals that go together."""
         return _ForceProblem(self.residuals, self.estimate, scale, repeats)
+
+    def cost(self, point: Point) -> float:
+        """Return the cost of a point."""
+        return float(self.costs(point, Rows.of(self.owner, 1)).sum())
 
     def start(self) -> Point:
         """Return the estimate of the motion, with the starts of the first frames."""
