@@ -29,6 +29,8 @@ from .open_loop_search import ENOUGH_EPISODES, ERRORS_PER_EPISODE
 
 KEPT_NOTE = "of the model that the fit started from, as these episodes do not observe it; "
 """Beginning of the note of an estimate that was kept."""
+DISTURBED = 4.0
+"""Division of the information of measured forces from which on a warning states it."""
 MENTIONED_GROWTH = 1.05
 """Growth of the variances of a fit to few episodes from which on their warning states it."""
 
@@ -228,6 +230,29 @@ def _unseen_warning(unseen: Sequence[FittedParameter]) -> list[str]:
     return [f"{listed([p.name for p in unseen])} are not observable in these data; to reveal them: {notes}."]
 
 
+def _force_warnings(told: Mapping[str, Any]) -> list[str]:
+    """Return where measured forces contradict the model, in words; empty where they do not."""
+    if not told["used"]:
+        return [
+            f"the measured forces are not used: the model's differ from them by {100 * told['unexplained']:.0f} % of "
+            "their size in the middle, whatever its parameters. Check that they are those that the driven body exerts, "
+            "not those on its sensor, in N and along the world's axes, and that nothing else touches the bodies."
+        ]
+    found = []
+    if told["apart"]:
+        found.append(
+            f"the measured forces on short and on long intervals ask for different values of {listed(told['apart'])}, "
+            "as where a hit does not follow the contact law: the estimates are those of the long intervals, and their "
+            "intervals hold both. Motions that begin in contact and without a hit would tell them apart."
+        )
+    if told["information_over"] > DISTURBED:
+        found.append(
+            "the measured forces differ from the model's by more than their noise: intervals are "
+            f"{told['information_over'] ** 0.5:.2g} times as wide as the noise alone would make them."
+        )
+    return found
+
+
 def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: FitRecord) -> PhysicsFit:
     """Return the stage's result from an estimate of the contact parameters.
 
@@ -249,6 +274,7 @@ def physics_fit(world: World, estimate: ContactEstimate, noise: Noise, record: F
     value = {p.name: p.estimate for p in fitted}
     contact = _numbers(None, world.contact, value)
     warnings += _unseen_warning([p for p in fitted if p.state == "not_observable"])
+    warnings += [] if record.forces is None else _force_warnings(record.forces)
     if record.episodes < ENOUGH_EPISODES:
         warnings.append(
             f"with fewer than {ENOUGH_EPISODES} episodes the intervals assume {_interval_assumption(record.shooting)}"

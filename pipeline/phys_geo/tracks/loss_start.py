@@ -43,7 +43,7 @@ def loss_start(residuals: ForceResiduals, estimate: ContactEstimate, scale: floa
     base, alone, sizes = _rolled(residuals, none[None])[0], [], []
     for k in wide:
         tried = np.repeat(none[None], round((limits[k, 1] - limits[k, 0]) / APART) + 1, 0)
-        tried[:, k] = np.linspace(*limits[k], len(tried))
+        tried[:, k] = np.linspace(limits[k, 0], limits[k, 1], len(tried))
         found = _rolled(residuals, tried)
         best = int(robust_loss(found.square().sum(-1), scale)[0].sum(-1).argmin())
         alone.append(((found[best] - base) / np.exp(tried[best, k])).flatten())

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,14 +11,17 @@ import torch
 from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.pipeline.geometry.rotation import quat_conjugate, quat_log, quat_multiply
+from cgwm.pipeline.optimization.problem import Point
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
-from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate, PhysicsFit
-from cgwm.pipeline.phys_geo.tracks.force_fit import with_forces
-from cgwm.pipeline.phys_geo.tracks.measured_forces import force_noise, measured_forces
+from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate, FitRecord, PhysicsFit, physics_fit
+from cgwm.pipeline.phys_geo.tracks.force_fit import _excess, _mixed, with_forces
+from cgwm.pipeline.phys_geo.tracks.force_residuals import ForceResiduals
+from cgwm.pipeline.phys_geo.tracks.loss_start import loss_start
+from cgwm.pipeline.phys_geo.tracks.measured_forces import MeasuredForce, force_noise, measured_forces
 from cgwm.pipeline.phys_geo.tracks.multiple_shooting import Shooting, ShootingPrior
 from cgwm.pipeline.physics import Rollout, World
 from cgwm.pipeline.physics.engine import rollout as roll_out
-from cgwm.pipeline.physics.parameters import contact_parameters
+from cgwm.pipeline.physics.parameters import Parameter, contact_parameters
 from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -192,3 +197,107 @@ def test_noise_of_forces_is_that_of_their_second_differences() -> None:
     rng = np.random.default_rng(0)
     slow = np.linspace(0, 3, 4000)[:, None] * np.array([1.0, 0.5, -2.0])
     assert abs(force_noise(slow + 0.05 * rng.standard_normal(slow.shape)) / 0.05 - 1) < 0.1
+
+
+def test_long_intervals_average_short_ones() -> None:
+    times = np.arange(0, 1.001, 0.01)
+    force = np.where(times[:, None] > 0.5, 2.0, 0.0) * np.array([1.0, 0.0, 0.0])
+    track = Track(times, np.zeros((len(times), 3)), np.tile(UPRIGHT, (len(times), 1)), force_n=force)
+    short = MeasuredForce.of(Episode("one", {}), 0, 0, track, 0.0, 0.1)
+    long = short.slow()
+    assert len(short.force_n) == 99 and len(long.force_n) == 9  # of ten short ones each, the last nine left out
+    np.testing.assert_allclose(long.edges_s, 0.005 + 0.1 * np.arange(10), atol=1e-12)
+    np.testing.assert_allclose(long.force_n[:, 0], [0, 0, 0, 0, 0, *[2.0] * 4], atol=1e-12)
+    assert abs(long.std_n - 0.1 / np.sqrt(10)) < 1e-12
+    np.testing.assert_allclose(long.spread_n[[0, 3, 6, 8]], long.std_n)
+    np.testing.assert_allclose(long.spread_n[[4, 5]], np.hypot(2.0, long.std_n))  # when it sets in
+    assert long.slow() is long
+
+
+def loss(name: str) -> Parameter:
+    return Parameter(name=name, unit="1", bounds=(1e-4, 100.0), logarithmic=True, reveals="motion", prior=(0.15, 1.5))
+
+
+class SumOfLosses:
+    """Residuals of forces that are a sum of friction and damping at given speeds, with one hit of another law."""
+
+    start_size = 0
+    forces = (None,)
+
+    def __init__(self, damping: float, friction: float) -> None:
+        self.speeds = torch.linspace(0.25, 0.05, 9, dtype=torch.float64)
+        self.measured = friction + damping * self.speeds
+        self.measured[1] += 40.0
+
+    def of(self, episode: int, values: torch.Tensor, starts: torch.Tensor) -> torch.Tensor:
+        del episode, starts
+        damping, friction = values.exp().unbind(1)
+        force = friction[:, None] + damping[:, None] * self.speeds
+        return torch.nn.functional.pad(((force - self.measured) / 0.05)[..., None], (0, 2))
+
+
+@pytest.mark.parametrize(("damping", "friction"), [(8.0, 2.0), (0.02, 3.0), (12.0, 1e-4)])
+def test_losses_begin_at_what_the_forces_ask_for(damping: float, friction: float) -> None:
+    names = [loss("rail.damping"), loss("rail.friction")]
+    known = ContactEstimate(parameters=names, values=np.log([0.15, 0.15]), covariance=np.diag([1.5**2, 1.5**2]))
+    residuals: Any = SumOfLosses(damping, friction)
+    found = loss_start(residuals, known, 4.0)
+    assert found is not None
+    np.testing.assert_allclose(np.exp(found), [damping, friction], rtol=0.01, atol=0.01)
+    assert loss_start(residuals, replace(known, covariance=np.diag([0.25, 0.25])), 4.0) is None
+
+
+def test_minima_that_are_both_probable_widen_the_interval() -> None:
+    def mode(value: float, std: float, share: float) -> tuple[Point, np.ndarray, float]:
+        return Point(values=batch([value])), np.array([[std**2]]), share
+
+    assert _mixed([mode(1.0, 0.1, 1.0)]) == 0.1**2
+    np.testing.assert_allclose(_mixed([mode(1.0, 0.1, 1.0), mode(3.0, 0.1, 1.0)]), 0.1**2 + 2.0)
+
+
+def test_estimates_by_long_and_by_short_intervals_may_differ_by_chance_alone() -> None:
+    slow: Any = SimpleNamespace(values=np.array([0.0, 0.0, 0.0]), covariance=np.diag([1.0, 1.0, 1.0]))
+    fast: Any = SimpleNamespace(values=np.array([1.0, 3.0, 0.5]), covariance=np.diag([0.25, 0.25, 1.0]))
+    np.testing.assert_allclose(_excess(slow, fast), [0.0, 9 - 3.84 * 0.75, 0.0])
+
+
+def test_what_the_model_leaves_unexplained_is_relative_to_the_forces() -> None:
+    force = np.array([[0.0, 0, 0], [2.0, 0, 0], [0, 4.0, 0], [0, 0, 2.0]])
+    measured = SimpleNamespace(force_n=force, std_n=0.01, spread_n=np.array([0.01, 0.1, 0.1, 0.1]))
+    residuals: Any = SimpleNamespace(forces=[[measured]])
+    off = torch.tensor([[9.0, 0, 0], [5.0, 0, 0], [0, 10.0, 0], [0, 0, 20.0]], dtype=torch.float64)
+    assert (
+        abs(ForceResiduals.unexplained(residuals, [off]) - 0.5) < 1e-12
+    )  # 1 N of 2 N; what does not touch is left out
+
+
+def told(**changes: Any) -> dict[str, Any]:
+    return {"used": True, "unexplained": 0.01, "apart": [], "information_over": 1.0, "converged": True} | changes
+
+
+@pytest.mark.parametrize(
+    ("record", "sentence"),
+    [
+        (told(), None),
+        (told(used=False, unexplained=1.02), "the measured forces are not used: the model's differ from them by 102 %"),
+        (told(apart=["contact_time_s"]), "on short and on long intervals ask for different values of contact_time_s"),
+        (told(information_over=9.0), "intervals are 3 times as wide as the noise alone would make them"),
+    ],
+)
+def test_forces_that_contradict_the_model_are_said(record: dict[str, Any], sentence: str | None) -> None:
+    fitted = physics_fit(world(), from_priors(), FINE, FitRecord(
+        episodes=9, search_episodes=9, noise_estimated=FINE, forces=record))  # fmt: skip
+    said = [text for text in fitted.warnings if "forces" in text]
+    assert [sentence in text for text in said] == [True] if sentence else not said
+
+
+@pytest.mark.evidence
+def test_forces_on_the_sensor_instead_of_by_the_finger_are_not_used() -> None:
+    one = push(0, 0.0)
+    finger = one.tracks["finger"]
+    assert finger.force_n is not None
+    turned = Episode("0", {"box": one.tracks["box"], "finger": replace(finger, force_n=-finger.force_n)})
+    prior, seen = from_priors(), Observations.of(world(), [turned], [(-1.0, 1.0)])
+    forces = measured_forces(world(), [turned], seen, FORCE_STD)
+    found, record = with_forces(world(), prior, forces, seen, 1e-12 * torch.eye(12, dtype=torch.float64)[None])
+    assert not record["used"] and record["unexplained"] > 0.9 and found is prior
