@@ -18,9 +18,9 @@ both.
 Losses in joints are known to decades before. Descents begin at what the forces ask for (`loss_start.py`), too, and
 where they end in two minima that are both probable, the interval holds both.
 
-The estimate of a search of many episodes counts with the spread of all samples that predict the motion about as well:
-the scatter between episodes gives each parameter's error, but its inverse claims combinations of parameters to be known
-a thousand times better than these samples show, where the motion hardly depends on them.
+The estimate of a search of many episodes counts with the spread of all samples that predict the motion about as well,
+as a density that holds over its whole width: the inverse of the scatter between episodes can claim that combinations of
+parameters are known a thousand times better, where the motion hardly depends on them.
 
 Forces that the model does not explain to within their noise count less: the information is divided by the misfit and,
 because errors of the model last, by the number of successive residuals that go together, (1 + r) / (1 - r) for the
