@@ -177,7 +177,16 @@ def brief(found: dict[str, Any]) -> dict[str, Any]:
     """Return what is kept of a diagnosis."""
     if "refused" in found:
         return found
-    keys = ("verdict", "selected", "aliases", "remaining_unexplained", "contact_chi2", "flight_before", "flight_after")
+    keys = (
+        "verdict",
+        "sentence",
+        "selected",
+        "aliases",
+        "remaining_unexplained",
+        "contact_chi2",
+        "flight_before",
+        "flight_after",
+    )
     keys += ("contact_limits",)
     return {key: found[key] for key in keys} | {
         "ranking": found["ranking"][:6],

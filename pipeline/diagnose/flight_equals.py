@@ -83,7 +83,6 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
         equals = list(step.equals)
         if step in ambiguous:
             kept, _ = separated(equals, contact, base.world, prepared.groups)
-            kept = _with_scales_of_sessions(kept, equals, prepared.groups)
             equals = _without_doubles(_with_aliases(kept, equals), [one for one in flagged if one is not step])
             final = _replaced(final, step.best, equals[0])
         chosen.append(tuple(equals))
@@ -104,18 +103,6 @@ def _is_asked(step: SelectionStep, steps: Sequence[SelectionStep]) -> bool:
     drag = any("drag" in one.candidate.effect.provides for one in step.equals)
     others = (one for other in steps if other is not step for one in other.equals)
     return not (drag and any("drag" in one.candidate.effect.needs for one in others))
-
-
-def _with_scales_of_sessions(
-    kept: Sequence[Evidence], equals: Sequence[Evidence], groups: Sequence[int]
-) -> list[Evidence]:
-    """Return the equals that contact admits, with a scale of lengths where episodes belong to several sessions.
-
-    Each session may have a scale of its own, of which flights show the mean; one scale for all is then as wrong in
-    contact as none.
-    """
-    own = [one for one in equals if one.name == SCALE and one not in kept]
-    return [*kept, *own] if len(set(groups)) > 1 else list(kept)
 
 
 def _undoubled(steps: Sequence[SelectionStep], world: World) -> tuple[list[SelectionStep], World]:
@@ -194,25 +181,34 @@ def separated(
         by_episode, moved = _gains_near(linear, linear.columns(variant.parameters), known[:, 0], known[:, 1], misfit)
         gains.append(by_episode / misfit)
         total[k] += moved - gains[k].sum()
-    kept = _not_ruled_out(equals, gains, total, linear)
+    kept = _not_ruled_out(equals, gains, total, linear, len(set(groups)) > 1)
     return kept, {e.name: float(g.sum()) for e, g in zip(equals, gains, strict=True)}
 
 
 def _not_ruled_out(
-    equals: Sequence[Evidence], gains: Sequence[Array], total: Array, linear: Linearization
+    equals: Sequence[Evidence], gains: Sequence[Array], total: Array, linear: Linearization, sessions: bool
 ) -> list[Evidence]:
     """Return the equals that contact does not rule out, the best first.
+
+    Where episodes belong to several sessions, each may have a scale of lengths of its own, of which flights show the
+    mean beside whatever else acts: one scale for all is then as wrong in contact as none, and what it gains there is
+    true without being all. So it is not ruled out, and rules nothing else out.
 
     Args:
         equals: The equals.
         gains: Gain of each in each episode (E,).
         total: Cost of each in flight and contact together.
         linear: Linearization of the contact segments, for the penalty of BIC.
+        sessions: Whether episodes belong to several sessions.
     """
     order = sorted(range(len(equals)), key=lambda k: (total[k] + _bic(equals[k], linear), equals[k].name))
-    best = min(order, key=lambda k: total[k])
+    apart = {k for k in order if sessions and equals[k].name == SCALE}
+    best = min([k for k in order if k not in apart] or order, key=lambda k: total[k])
     kept = []
     for k in order:
+        if k in apart:
+            kept.append(equals[k])
+            continue
         worse = gains[best] - gains[k]
         spread = worse.std(ddof=1) / math.sqrt(len(worse)) if len(worse) > 1 else math.inf
         out = total[k] - total[best] > LIMITS.separate_chi2 and worse.mean() > LIMITS.separate_t * spread

@@ -6,6 +6,10 @@ leave a lead that suffices. Both follow from noncentralities (`contact_informati
 size. How large an effect is, is not known: its size is taken as log-uniform from that size to `SIZES` times it. The
 worth of motions is the expected number of effects that are seen then, and told apart, each counted half, and the one
 that the data suggest more than others; motions are chosen one after the other (greedily).
+
+A friction pyramid has no number, so that it is no effect that is to be told apart. Where slides fit it as well as the
+friction by direction that they show, those along its axes and between them are asked for: it brakes all along an axis
+alike, and those between more.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ from ..segments.contact_phases import is_round
 from ..segments.prepare import Prepared
 from .contact_information import Channel, Reduced, contact_information
 from .experiments import described
-from .hand_motions import face_down, hand_motions
+from .hand_motions import HandMotion, face_down, hand_motions
 from .thresholds import THRESHOLDS
 from .verdict import Findings
 
@@ -120,7 +124,7 @@ def next_motions(prepared: Prepared, findings: Findings, candidates: Sequence[Ca
         rivals=rivals,
         leading=_leading(findings),
     )
-    chosen = best_motions(question, len(motions))
+    chosen = of_pyramid(motions) if findings.as_pyramid else best_motions(question, len(motions))
     if not chosen:
         return None
     before, after = (question.shares(some, [-1])[0][:, 0] for some in ([], chosen))
@@ -158,6 +162,15 @@ def best_motions(question: Question, count: int) -> list[int]:
         chosen.append(best)
         worth = float(once[best])
     return chosen
+
+
+def of_pyramid(motions: Sequence[HandMotion]) -> list[int]:
+    """Return the fastest slides along the two axes of a friction pyramid, and between them."""
+    slides = [k for k, one in enumerate(motions) if one.manner in ("slide", "push") and not one.aside_m]
+    return [
+        max((k for k in slides if motions[k].heading_deg == heading), key=lambda k: motions[k].speed_m_s)
+        for heading in (0.0, 90.0, 45.0)
+    ]
 
 
 def _worth(question: Question, seen: Array, apart: Array) -> Array:

@@ -65,7 +65,7 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         others = [e.candidate.spec for e in one.equals[1:]]
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
     named = listed([word or name for word, name in zip(words, names, strict=True)])
-    return f"{_called(findings)}: {named}.{_apart(findings)}{_rest(findings, law)}"
+    return f"{_called(findings)}: {named}.{_apart(findings)}{_as_good(findings)}{_rest(findings, law)}"
 
 
 def _nearest(findings: Findings) -> str:
@@ -78,6 +78,14 @@ def _nearest(findings: Findings) -> str:
             words.append(
                 f" Nearest is {form.effect}, but these flights hardly tell it from {form.words}. Next, {form.then}."
             )
+    return "".join(words)
+
+
+def _as_good(findings: Findings) -> str:
+    """Return which forms of the named forces the flights fit as well, and what tells them apart; empty for none."""
+    words = [
+        f" These flights do not tell {form.effect} from {form.words}. Next, {form.then}." for form in findings.as_good
+    ]
     return "".join(words)
 
 
@@ -252,9 +260,8 @@ def misfit_warnings(findings: Findings) -> list[str]:
 
 
 def law_warnings(findings: Findings) -> list[str]:
-    """Return a warning for each effect whose motions fit another law equally well."""
-    found = [f"{form.effect}: these flights fit {form.words} as well. Next, {form.then}." for form in findings.as_good]
-    return found + [
+    """Return a warning for each effect that slides show no better than a friction pyramid does."""
+    return [
         f"{name}: not named, since the slides fit a friction limited along each of two axes by itself as well, as "
         "engines with a friction pyramid have it and no surface does. Next, where they were measured on a surface, "
         "record slides along x, along y and between them."

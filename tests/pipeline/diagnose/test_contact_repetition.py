@@ -11,7 +11,7 @@ from cgwm.pipeline.diagnose.contact_tests.impact import ImpactTest
 from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
 from cgwm.pipeline.diagnose.effect_selection import SelectionStep
 from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.flight_equals import _undoubled, _with_scales_of_sessions
+from cgwm.pipeline.diagnose.flight_equals import _not_ruled_out, _undoubled
 from cgwm.pipeline.diagnose.flight_findings import _Search
 from cgwm.pipeline.diagnose.group_values import _Scored, _unlike
 from cgwm.pipeline.diagnose.robust_fit import robust_repetition
@@ -63,10 +63,22 @@ def test_friction_that_is_lower_at_rest_is_the_smeared_end_of_a_slip(rise: float
     assert len(SlidingTest().bars([evidence("stribeck_friction", (rise,))], data)) == count
 
 
-def test_contact_rules_no_scale_of_lengths_out_where_sessions_may_have_their_own() -> None:
-    scale, clock = evidence("length_scale"), evidence("clock_scale")
-    assert _with_scales_of_sessions([clock], [scale, clock], (0, 1, 0)) == [clock, scale]
-    assert _with_scales_of_sessions([clock], [scale, clock], (0, 0, 0)) == [clock]
+@pytest.mark.parametrize(
+    ("total", "kept", "alone"),
+    [
+        ((0.0, 90.0, 95.0), {"length_scale", "clock_scale", "buoyancy"}, {"length_scale"}),
+        ((90.0, 0.0, 95.0), {"length_scale", "clock_scale"}, {"clock_scale"}),
+    ],
+)
+def test_a_scale_of_lengths_neither_rules_out_nor_is_ruled_out_where_sessions_may_have_their_own(
+    total: tuple[float, ...], kept: set[str], alone: set[str]
+) -> None:
+    equals = [evidence(name) for name in ("length_scale", "clock_scale", "buoyancy")]
+    gains = [np.full(8, -cost / 8) for cost in total]
+    found = [
+        _not_ruled_out(equals, gains, np.array(total), linear(np.zeros(8)), sessions) for sessions in (True, False)
+    ]
+    assert [{one.name for one in some} for some in found] == [kept, alone]
 
 
 def test_effects_that_do_the_same_are_kept_beside_the_first() -> None:

@@ -8,7 +8,7 @@ import torch
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.diagnose.contact_information import Channel, contact_information
 from cgwm.pipeline.diagnose.hand_motions import HandMotion, face_down, hand_motions, start_states
-from cgwm.pipeline.diagnose.next_motions import Question, best_motions
+from cgwm.pipeline.diagnose.next_motions import Question, best_motions, of_pyramid
 from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import State, World
 from cgwm.pipeline.physics.effects import load_effect
@@ -52,6 +52,14 @@ def test_a_body_lies_on_its_largest_stable_face() -> None:
     assert heights.min() == pytest.approx(0.0, abs=1e-12)
     assert (heights < 1e-9).sum() == 4
     assert state.velocity_m_s[0, 0].tolist() == pytest.approx([0.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize("ball", [True, False])
+def test_slides_along_and_between_two_axes_tell_a_friction_pyramid(ball: bool) -> None:
+    motions = hand_motions(ball)
+    chosen = [motions[k] for k in of_pyramid(motions)]
+    assert [one.heading_deg for one in chosen] == [0.0, 90.0, 45.0]
+    assert {(one.speed_m_s, one.aside_m) for one in chosen} == {(2.5 if ball else 2.0, 0.0)}
 
 
 def test_a_ball_that_rolls_does_not_slip_and_a_push_slips_more_than_it_moves() -> None:

@@ -142,7 +142,7 @@ def test_a_force_by_height_is_not_two_effects_that_imitate_it_together() -> None
     [
         (3.0, 1.0, " Nearest is wind, but the flights fit the same force times x better."),
         (-2.0, -1.0, " Nearest is wind, but these flights hardly tell it from the same force times x. Next, go on."),
-        (1.0, -2.0, ""),
+        (1.0, -3.0, ""),
     ],
 )
 def test_the_sentence_says_in_which_other_form_a_force_comes_near(gain: float, odds: float, words: str) -> None:
