@@ -53,10 +53,12 @@ class SlidingThresholds:
     gain_t: float = threshold(
         1.0,
         "standard errors",
-        "mean gain of held-out episodes by such an effect",
+        "mean gain of held-out episodes",
         "by argument: as `impact.gain_t`",
         "real-like development: a map that three episodes speak for and one against was the only false name of sliding "
-        "in 119 captures without an effect (757)",
+        "in 119 captures without an effect (757); of 9 other effects that slides named in 151 captures and 14 "
+        "experiments in sequence the one below it (0.77) is false, a drag in no library that was called a rolling "
+        "resistance",
     )
     least_size: float = threshold(
         0.3,

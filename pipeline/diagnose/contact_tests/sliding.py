@@ -114,7 +114,7 @@ class SlidingTest(ContactTest):
             carriers=min(parameters + 1, self.limits.carriers),
             carries=self.limits.carries,
             without_best=self.limits.without_best if data.flown else -math.inf,
-            gain_t=self.limits.gain_t if best.gains and parameters > self.limits.many_parameters else None,
+            gain_t=self.limits.gain_t if best.gains else None,
         )
         pressed = best.name in self.limits.as_friction
         if doubted or pressed or parameters > self.limits.many_parameters or (flexible and data.flown):
