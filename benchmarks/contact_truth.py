@@ -137,11 +137,11 @@ def mujoco_model(thrown: Thrown, condim: int, settings: dict[str, Any]) -> Any:
       <compiler meshdir="/"/>
       <option timestep="{settings.get("timestep", TRUTH_STEP_S)}" cone="{settings.get("cone", "elliptic")}"
         solver="{settings.get("solver", "Newton")}" iterations="100" tolerance="1e-12"/>
-      <default><geom condim="{condim}" friction="{FRICTION} {TORSION_M} {ROLLING_M}"
+      <default><geom condim="{condim}" friction="{settings.get("friction", FRICTION)} {TORSION_M} {ROLLING_M}"
         solref="{_words(settings.get("solref", SOLREF))}"/></default>
       <asset>{thrown.assets}</asset>
       <worldbody>
-        <geom type="plane" size="5 5 1"/>
+        <geom type="plane" size="5 5 1" pos="0 0 {settings.get("height_m", 0.0)}"/>
         <body name="body"><freejoint/>{thrown.geoms}
           <inertial pos="{_words(body.com[0])}" mass="{float(body.mass)}" fullinertia="{inertia}"/></body>
       </worldbody>

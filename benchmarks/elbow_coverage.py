@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -36,7 +37,7 @@ from cgwm.pipeline.physics.parameters import (
 )
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.trajectories.track_noise import Noise
-from cgwm.schemas import ContactParameters, PhysConfig
+from cgwm.schemas import ContactParameters, FittedParameter, PhysConfig
 from elbow import SEED, TEST, TRAIN, Array, Rival, Tosses, nominal, tosses_of
 from scipy.spatial.transform import Rotation
 from store import Store
@@ -66,7 +67,7 @@ def thrown(source: Path, work: Path, count: int) -> tuple[Tosses, Capture]:
     return tosses_of(model, capture, chosen, NOISE), capture
 
 
-def drawn(parameters: list[Parameter], rng: np.random.Generator) -> Array:
+def drawn(parameters: Sequence[Parameter], rng: np.random.Generator) -> Array:
     """Return coordinates (P,) from the priors, within their bounds."""
     values = [p.encode(p.prior[0]) + p.prior[1] * rng.standard_normal() for p in parameters]
     return np.clip(values, *np.array([p.limits for p in parameters]).T)
@@ -104,29 +105,48 @@ def measured(world: World, tosses: Tosses, position: Array, quat: Array, rng: np
 
 
 def measure(source: Path, work: Path, count: int, truth: str, seed: int) -> dict[str, Any]:
-    """Return for each parameter the truth, what a fit found, and whether its interval holds the truth."""
+    """Return what a fit to simulated tosses of a seed says of each parameter."""
     torch.set_num_threads(1)
     tosses, capture = thrown(source, work, count)
     world, rng = tosses.world, np.random.default_rng(seed)
     parameters = [*contact_parameters(world), *chain_parameters(world), GROUND_SHIFT]
     values = drawn(parameters, rng)
     episodes = measured(world, tosses, *motion(truth, tosses, capture, parameters, values), rng)
-    found = {p.name: p for p in fit_physics(world, episodes, PhysConfig(seed=seed)).parameters}
-    rows = {}
+    found = fit_physics(world, episodes, PhysConfig(seed=seed)).parameters
+    return {"parameters": judged(parameters, values, found, UNLIKE if truth == "mujoco" else ())}
+
+
+def judged(
+    parameters: Sequence[Parameter], values: Array, found: Sequence[FittedParameter], unlike: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Return by parameter the truth, what a fit found, and whether its interval holds the truth."""
+    by_name, rows = {one.name: one for one in found}, {}
     for parameter, coordinate in zip(parameters, values, strict=True):
         name = "ground_offset_m" if parameter is GROUND_SHIFT else parameter.name
-        if truth == "mujoco" and name in UNLIKE:
+        if name in unlike or name not in by_name:
             continue
-        value, one = float(parameter.decode(torch.tensor(coordinate))), found[name]
+        value, one = float(parameter.decode(torch.tensor(coordinate))), by_name[name]
         low, high = one.interval_95 or (np.nan, np.nan)
+        away = (parameter.encode(one.estimate) - coordinate) / parameter.prior[1]
         width = (one.std_error or np.nan) / (one.estimate if parameter.logarithmic else 1.0) / parameter.prior[1]
         rows[name] = {
             "truth": value, "estimate": one.estimate, "low": low, "high": high, "state": one.state,
-            "holds": bool(low <= value <= high), "error_over_prior": float(
-                (parameter.encode(one.estimate) - coordinate) / parameter.prior[1]
-            ), "std_over_prior": float(width),
+            "holds": bool(low <= value <= high), "error_over_prior": float(away), "std_over_prior": float(width),
         }  # fmt: skip
-    return {"parameters": rows}
+    return rows
+
+
+def summary(results: Sequence[dict[str, dict[str, Any]]]) -> None:
+    """Print for each parameter how many intervals hold, errors and standard errors in the prior's, and the states."""
+    for name in dict.fromkeys(name for row in results for name in row):
+        rows = [row[name] for row in results if name in row]
+        error, claimed = (
+            np.sqrt(np.mean([row[key] ** 2 for row in rows])) for key in ("error_over_prior", "std_over_prior")
+        )
+        print(
+            f"{name:24s} holds {sum(row['holds'] for row in rows)} of {len(rows)}; error {error:.2f}, standard error "
+            f"{claimed:.2f} of the prior's; {dict(Counter(row['state'] for row in rows))}"
+        )
 
 
 def main() -> int:
@@ -148,17 +168,7 @@ def main() -> int:
         for seed in range(first, last + 1)
     }
     store.fill(measure, jobs, given.workers)
-    results = [row["parameters"] for row in store.results() if row["key"] in jobs]
-    for name in results[0]:
-        rows = [row[name] for row in results]
-        states = Counter(row["state"] for row in rows)
-        error, claimed = (
-            np.sqrt(np.mean([row[key] ** 2 for row in rows])) for key in ("error_over_prior", "std_over_prior")
-        )
-        print(
-            f"{name:24s} holds {sum(row['holds'] for row in rows)} of {len(rows)}; error {error:.2f}, standard error "
-            f"{claimed:.2f} of the prior's; {dict(states)}"
-        )
+    summary([row["parameters"] for row in store.results() if row["key"] in jobs])
     return 0
 
 

@@ -163,13 +163,11 @@ def _weights(log_ratio: Array, fit: Array, errors: float, least: float) -> tuple
 
 
 def episode_covariance(result: SearchResult, minimum: int = 8) -> Array | None:
-    """Estimate the covariance (P, P) of the error of the mean from the scatter between episodes.
+    """Return the covariance (P, P) of the bagged posterior (Huggins & Miller 2019, "Robust inference with BayesBag").
 
     Episodes are drawn anew with replacement, and the samples are weighed by their costs (the bootstrap; Efron 1979): so
-    far would other episodes have moved the mean. Where the data say little, the mean stays near the prior's whatever
-    the truth is. With C the posterior's covariance, the mean is off by C / S^2 of the distance between the truth and
-    the prior's mean, which has the prior's covariance S^2: that adds C / S^2 C, all of S^2 without data. As a mean of n
-    effective samples it is off by C / n more.
+    far would other episodes have moved the mean, also where the model is wrong. To this scatter the posterior's own
+    covariance is added, which is the prior's where the data say nothing.
 
     Args:
         result: Result of the search.
@@ -187,5 +185,4 @@ def episode_covariance(result: SearchResult, minimum: int = 8) -> Array | None:
     weight = np.exp(logs - logs.max(0))
     means = (weight / weight.sum(0)).T @ result.samples[finite]
     scatter = np.atleast_2d(np.cov(means.T)) * count / (count - 1)
-    pulled = result.covariance / np.square(result.prior.std) @ result.covariance
-    return scatter + pulled + result.covariance / result.effective_samples
+    return scatter + result.covariance

@@ -125,7 +125,8 @@ def test_the_means_covariance_is_that_of_the_episodes_minimizers_where_these_tel
     np.testing.assert_allclose(result.mean, places.mean(0), atol=0.02)
     wanted = np.cov(places.T) / len(places)
     std = np.sqrt(wanted.diagonal())
-    np.testing.assert_allclose(found / np.outer(std, std), wanted / np.outer(std, std), atol=0.15)
+    scatter = found - result.covariance
+    np.testing.assert_allclose(scatter / np.outer(std, std), wanted / np.outer(std, std), atol=0.15)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.05])
@@ -135,8 +136,9 @@ def test_what_the_costs_do_not_show_is_as_unknown_as_before(slope: float) -> Non
     result.costs[:, 5] += slope * result.samples[:, 1]
     found = episode_covariance(result)
     assert found is not None
-    assert found[0, 0] == pytest.approx(np.var(places[:, 0], ddof=1) / len(places), rel=0.2)
-    assert found[1, 1] == pytest.approx(PRIOR.std[1] ** 2, rel=0.15)
+    scatter = found - result.covariance
+    assert scatter[0, 0] == pytest.approx(np.var(places[:, 0], ddof=1) / len(places), rel=0.2)
+    assert 0.85 < found[1, 1] / PRIOR.std[1] ** 2 < 1.15
 
 
 def test_the_covariance_is_that_of_the_errors_of_repeated_searches_with_a_truth_from_the_prior() -> None:
@@ -155,7 +157,7 @@ def test_the_covariance_is_that_of_the_errors_of_repeated_searches_with_a_truth_
         errors.append(result.mean[0] - truth)
         claimed.append(found[0, 0])
     assert 0.4 < np.mean(np.square(errors)) < 0.9
-    assert np.mean(claimed) == pytest.approx(np.mean(np.square(errors)), rel=0.25)
+    assert 0.95 < np.mean(claimed) / np.mean(np.square(errors)) < 1.5
 
 
 def test_few_episodes_have_no_covariance() -> None:
