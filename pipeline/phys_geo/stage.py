@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,7 +32,7 @@ from ...schemas.materials import pair_of
 from ..physics.chain_values import FACTORS, with_chain_values
 from ..physics.effects.registry import effect_of
 from ..physics.rollout_cost import durations
-from ..physics.world import World, inertia_elements
+from ..physics.world import Body, World, inertia_elements
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
 from ..runtime.work_budget import motion_doubt, within_budget
@@ -77,6 +78,8 @@ def fit_motion(
     else:
         config = paper_config(model.file, capture, config)
     ready = _with_surfaces(replace(model, file=_physics_start(model, capture, config)), capture)
+    solver = ready.file.solver.model_copy(update={"sweeps": _sweeps(World.from_model(ready))})
+    ready = replace(ready, file=ready.file.model_copy(update={"solver": solver}))
     if config.supervise == "tracks":
         warnings = (*warnings, *require_outside(World.from_model(ready), capture, split))
     started = time.perf_counter()
@@ -127,20 +130,30 @@ def _physics_start(model: Model, capture: Capture, config: PhysConfig) -> ModelF
             "pairs": laws.pairs,
             # the ground of the capture, as an earlier fit may have moved the model's
             "ground": capture.manifest.world.ground or model.file.ground,
-            "solver": Solver(contact_model=config.contact_law, step_s=config.step_s, sweeps=_sweeps(model.file)),
+            "solver": Solver(contact_model=config.contact_law, step_s=config.step_s),
             "effects": effects,
             "warnings": tuple(text for text in model.file.warnings if text not in stale),
         }
     )
 
 
-def _sweeps(file: ModelFile) -> int:
+def _sweeps(world: World) -> int:
     """Return the number of sweeps over the contacts: more where a body may touch several things at once.
 
     With few, a body that leans on a wall and stands on a floor never comes to rest.
     """
-    crowded = len(file.surfaces) > 1 or len(file.tracked) > 1
+    pairs = itertools.combinations(world.surfaces, 2)
+    size = max((_diameter(world.bodies[k]) for k in world.tracked), default=0.0)
+    crowded = len(world.tracked) > 1 or any(not one.apart(other, size) for one, other in pairs)
     return CROWDED_SWEEPS if crowded else Solver().sweeps
+
+
+def _diameter(body: Body) -> float:
+    """Return the diameter of a sphere about all colliding spheres of a body [m]."""
+    if not body.radii.shape[-1]:
+        return 0.0
+    middle = body.centers[0].mean(0)
+    return 2 * float(((body.centers[0] - middle).norm(dim=-1) + body.radii[0]).amax())
 
 
 def _of_materials(bodies: Sequence[BodyModel], capture: Capture) -> tuple[BodyModel, ...]:

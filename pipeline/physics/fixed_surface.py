@@ -72,6 +72,30 @@ class FixedSurface:
         low, high = (torch.as_tensor(x).to(points) for x in self.mesh.bounds)
         return torch.maximum(low - local, local - high).clamp_min(0.0).square().sum(-1).sqrt()
 
+    @property
+    def extent(self) -> tuple[Tensor, Tensor]:
+        """Least and largest coordinates (3,) of the surface in its frame [m]."""
+        if self.mesh is not None:
+            low, high = (torch.as_tensor(x).to(self.size) for x in self.mesh.bounds)
+            return low, high
+        if self.kind == HALF_SPACE:
+            far = torch.full_like(self.size[0], torch.inf)
+            return -far, torch.cat((far[:2], torch.zeros_like(far[2:])))
+        return -self.size[0], self.size[0]
+
+    def apart(self, other: FixedSurface, distance_m: float) -> bool:
+        """Return whether the boxes of two surfaces are seen to be farther apart than a distance, along their axes."""
+        return self._beyond(other, distance_m) or other._beyond(self, distance_m)
+
+    def _beyond(self, other: FixedSurface, distance_m: float) -> bool:
+        ends = torch.stack(other.extent)
+        if not bool(ends.isfinite().all()):
+            return False
+        corners = torch.cartesian_prod(*ends.unbind(1))
+        world = other.to_world(corners[None])[0] + other.position[0]
+        local, (low, high) = self.local(world[None])[0], self.extent
+        return bool((local.amin(0) > high + distance_m).any() or (local.amax(0) < low - distance_m).any())
+
     def distances(self, local: Tensor) -> tuple[Tensor, Tensor]:
         """Return signed distances (n, C) [m] and outward normals (n, C, 3) of points in the frame of the surface."""
         if self.kind == HALF_SPACE:

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.phys_geo.stage import CROWDED_SWEEPS, _sweeps
 from cgwm.pipeline.phys_geo.surface_starts import require_outside
 from cgwm.pipeline.physics import Body, World
 from cgwm.pipeline.physics.chain import Chain, Joint
 from cgwm.pipeline.physics.contact_detection import Placed
-from cgwm.pipeline.physics.fixed_surface import KINDS, FixedSurface
+from cgwm.pipeline.physics.fixed_surface import BOX, CYLINDER, HALF_SPACE, KINDS, FixedSurface
 from cgwm.pipeline.physics.surface_detection import surface_gap
 from cgwm.schemas import InputDataError
 from helpers.chains import chained, link
-from helpers.worlds import batch
+from helpers.fixed_surfaces import surface
+from helpers.worlds import ball_body, batch, law, world_of
 
 
 def capture_of(heights_m: tuple[float, ...], quat: np.ndarray | None) -> Any:
@@ -72,3 +74,23 @@ def test_a_body_at_rest_has_its_spheres_where_its_frame_is(motion: Literal["free
     turn = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
     placed = Placed.still(body, torch.tensor([[1.0, 2.0, 3.0]]), turn)
     assert torch.allclose(placed.reference[:, None] + placed.arms(), torch.tensor([[[1.0, 2.5, 3.0]]]))
+
+
+@pytest.mark.parametrize(
+    ("second", "apart"),
+    [
+        (surface("b", BOX, (0.0, 0.5, 0.0), size=(0.3, 0.1, 0.01)), True),
+        (surface("b", BOX, (0.0, 0.31, 0.0), size=(0.3, 0.1, 0.01)), False),
+        (surface("b", BOX, (0.0, 0.5, 0.0), quat=(np.cos(0.9), 0.0, 0.0, np.sin(0.9)), size=(0.9, 0.1, 0.01)), False),
+        (surface("b", HALF_SPACE, (0.0, 0.0, -0.2)), True),
+        (surface("b", HALF_SPACE, (0.0, 0.0, -0.1)), False),
+        (surface("b", CYLINDER, (0.6, 0.0, 0.0), size=(0.1, 0.1, 0.5)), True),
+    ],
+)
+def test_surfaces_that_no_body_can_touch_at_once_need_no_more_sweeps(second: FixedSurface, apart: bool) -> None:
+    """A ball of 0.12 m; the first surface is 0.6 m by 0.2 m. One that is turned by 103 deg about z reaches it."""
+    ball = world_of(ball_body(0.06), contact=law())
+    first = surface("a", BOX, size=(0.3, 0.1, 0.01))
+    assert first.apart(second, 0.12) == second.apart(first, 0.12) == apart
+    assert _sweeps(replace(ball, surfaces=(first, second))) == (10 if apart else CROWDED_SWEEPS)
+    assert _sweeps(replace(ball, surfaces=(first,))) == 10
