@@ -97,6 +97,11 @@ class Similarity:
         pose[:3, 3] = self.scale * T_cam_world[:3, 3] - rotation @ self.translation
         return pose
 
+    def then(self, motion: Similarity) -> Similarity:
+        """Return this transform followed by another one."""
+        scale, rotation = motion.scale * self.scale, motion.rotation @ self.rotation
+        return Similarity(scale, rotation, motion.scale * motion.rotation @ self.translation + motion.translation)
+
     @staticmethod
     def identity() -> Similarity:
         """Return the identity transform."""

@@ -46,7 +46,7 @@ from .metric_scale import MetricFrame, from_camera_distance, from_known_distance
 from .photos import Inputs, gather, video_label
 from .reconstruction import Array, SfmCamera, SfmModel, Similarity, world_from_cam
 from .turntable_motion import TurntableMotion
-from .world_frame import dominant_plane, ground_frame
+from .world_frame import dominant_plane, ground_frame, upright_frame
 
 CAMERAS_NAME = "cameras.json"
 REPORT_NAME = "calibration.json"
@@ -197,7 +197,9 @@ def _world(capture: Capture, model: SfmModel) -> tuple[MetricFrame | None, Simil
         return frame, frame.similarity, frame.source, warnings
     similarity = frame.similarity if frame else Similarity.identity()
     if ground is None:
-        return frame, similarity, "that of structure from motion: arbitrary axes and origin", warnings
+        gravity = np.array(capture.manifest.world.gravity_m_s2)
+        up = -gravity / np.linalg.norm(gravity) if gravity.any() else np.array([0.0, 0.0, 1.0])
+        return frame, *_upright(model, similarity, up), warnings
     normal = np.array(ground.normal)
     motion = ground_frame(model.transformed(similarity), normal)
     if motion is None:
@@ -205,15 +207,21 @@ def _world(capture: Capture, model: SfmModel) -> tuple[MetricFrame | None, Simil
             "no plane was found that could be the ground: the axes and the origin of the world are arbitrary; "
             "give a marker with a pose"
         )
-        return frame, similarity, "that of structure from motion: arbitrary axes and origin", warnings
+        return frame, *_upright(model, similarity, normal), warnings
     height = ground.offset_m * normal if frame else np.zeros(3)
-    combined = Similarity(
-        similarity.scale,
-        motion.rotation @ similarity.rotation,
-        motion.rotation @ similarity.translation + motion.translation + height,
-    )
+    combined = similarity.then(Similarity(1.0, motion.rotation, motion.translation + height))
     words = "the dominant plane of the sparse points is the ground; the origin and the x axis on it are arbitrary"
     return frame, combined, words, warnings
+
+
+def _upright(model: SfmModel, similarity: Similarity, up: Array) -> tuple[Similarity, str]:
+    """Return the transform into a world whose vertical is that of the photos, and what fixes the world."""
+    motion = upright_frame(model.transformed(similarity), up)
+    if motion is None:
+        return similarity, "that of structure from motion: arbitrary axes and origin"
+    return similarity.then(motion), (
+        "that of structure from motion: arbitrary axes and origin; the photos' rows of pixels are taken to be level"
+    )
 
 
 def _find_markers(capture: Capture, model: SfmModel) -> dict[int, dict[str, Array]]:

@@ -1,4 +1,4 @@
-"""World frame for cameras without a reference to the world: the dominant plane becomes the ground."""
+"""World frame for cameras without a reference to the world: from the dominant plane, or from how photos are held."""
 
 from __future__ import annotations
 
@@ -13,6 +13,11 @@ _MIN_SHARE = 0.1
 """Minimum share of the sparse points on the plane."""
 _MAX_BELOW = 0.05
 """Maximum share of the sparse points below the plane."""
+_LEAST_SPREAD = 0.02
+"""Least spread of the second of the three axes of the photos' rows of pixels: those of a walk straight on are parallel,
+and do not tell by how much cameras look down."""
+_LEAST_UPRIGHT = 0.5
+"""Least length of the mean of the cameras' up directions: photos on their side or from below and above cancel it."""
 
 
 def ground_frame(model: SfmModel, normal_world: Array, seed: int = 0) -> Similarity | None:
@@ -38,6 +43,32 @@ def ground_frame(model: SfmModel, normal_world: Array, seed: int = 0) -> Similar
     focus = _focus(model)
     origin = focus - (normal @ focus - offset) * normal
     return Similarity(1.0, rotation, -rotation @ origin)
+
+
+def upright_frame(model: SfmModel, up_world: Array) -> Similarity | None:
+    """Return the rotation that puts the cameras upright: rows of pixels, which people hold level, become horizontal.
+
+    A camera may look down or up without turning this direction, in which the cameras' rows have least extent. Of
+    cameras whose rows are parallel it is the mean of their up directions. It is a guess that suits a view, not a
+    measurement.
+
+    Args:
+        model: The model, in any frame.
+        up_world: The vertical of the world frame, unit vector, shape (3,).
+
+    Returns:
+        The transform, of scale 1 about the origin, or None if the photos were taken at all angles.
+    """
+    poses = np.array([*model.T_cam_world.values()])
+    rows, mean = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0)
+    if np.linalg.norm(mean) < _LEAST_UPRIGHT:
+        return None
+    up = mean / np.linalg.norm(mean)
+    spread, axes = np.linalg.eigh(rows.T @ rows / len(rows))
+    level = axes[:, 0] * np.sign(axes[:, 0] @ up)
+    if spread[1] > _LEAST_SPREAD and level @ up > _LEAST_UPRIGHT:
+        up = level
+    return Similarity(1.0, _basis(up_world, np.array([1.0, 0.0, 0.0])) @ _basis(up, rows[0]).T, np.zeros(3))
 
 
 def dominant_plane(points: Array, centers: Array, distance: float, seed: int = 0) -> tuple[Array, float] | None:

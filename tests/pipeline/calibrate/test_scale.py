@@ -11,7 +11,7 @@ from cgwm.pipeline.calibrate.markers import detect_markers, dictionary, marker_c
 from cgwm.pipeline.calibrate.metric_scale import from_camera_distance, from_known_distance, from_markers, umeyama
 from cgwm.pipeline.calibrate.reconstruction import SfmModel, Similarity
 from cgwm.pipeline.calibrate.triangulation import triangulate
-from cgwm.pipeline.calibrate.world_frame import dominant_plane, ground_frame
+from cgwm.pipeline.calibrate.world_frame import dominant_plane, ground_frame, upright_frame
 from cgwm.schemas import InputDataError, KnownCameraDistance, KnownDistance, Marker, NotConvergedError, Pose
 from helpers.sfm_scene import make_scene, rotation_about
 
@@ -237,3 +237,27 @@ def test_ground_frame_puts_the_plane_at_zero_and_the_cameras_above(world, model)
 def test_no_ground_where_no_plane_is_below_everything(world):
     points = np.random.default_rng(0).normal(size=(1000, 3))
     assert dominant_plane(points, world.centers() * 10, 1.5) is None
+
+
+@pytest.mark.parametrize("count", [4, 16])
+def test_photos_are_upright_where_nothing_tells_the_world(world, model, count):
+    """An arc of cameras that look down at the scene: the mean of their up directions leans, their rows do not."""
+    up = np.array([0.0, 0.0, 1.0])
+    arc = replace(model, T_cam_world=dict([*model.T_cam_world.items()][:count]))
+    motion = upright_frame(arc, up)
+    assert motion is not None and motion.scale == 1.0
+    turned = arc.transformed(motion)
+    rows = np.array([pose[0, :3] for pose in turned.T_cam_world.values()])
+    np.testing.assert_allclose(rows @ up, 0.0, atol=1e-6)
+    whole = TRUE.rotation @ motion.rotation.T  # from the new world to the true one: a turn about the vertical
+    np.testing.assert_allclose(whole @ up, up, atol=1e-6)
+
+
+def test_photos_at_all_angles_are_not_made_upright(world):
+    rolled = {
+        name: np.block(
+            [[rotation_about([0, 0, 1], np.pi * (k % 2)) @ pose[:3, :3], pose[:3, 3:]], [np.zeros((1, 3)), 1]]
+        )
+        for k, (name, pose) in enumerate(world.T_cam_world.items())
+    }
+    assert upright_frame(replace(world, T_cam_world=rolled), np.array([0.0, 0.0, 1.0])) is None
