@@ -122,7 +122,7 @@ INLINE int flat_face(const Problem& problem, const Environment& env, int b, cons
     return face;
 }
 
-const int NEAR_ROOM = 32;
+const int NEAR_ROOM = HOST ? 64 : 32;
 struct Near {  // edges of a hull that are near another one; all of them where more are than there is room for
     int count, listed[NEAR_ROOM];
 #if HOST
