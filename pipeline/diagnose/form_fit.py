@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -155,24 +156,30 @@ class FormFit:
         step = self._solved([*(k for k in self.rest if k not in gone), *form, *further], without)
         if any(step[k] < 0 for k in further if k in self.nonnegative):
             return self.in_its_stead(form, dispersion)
-        slopes = self.score - self.information @ step
-        q, dof = _scatter(self.information[:, form][:, :, form], slopes[:, form])
+        own = self.information[:, form]
+        q, dof = _scatter(own[:, :, form], self.score[:, form] - own @ step)
         counts = LIMITS.model_counts + dof
         return FormCost(
             self._cost(step) / dispersion, max(1.0, (LIMITS.model_counts + q / dispersion) / counts), counts
         )
 
+    @cached_property
+    def _total(self) -> tuple[Array, Array]:
+        """Information (n, n) and score (n,) of all episodes."""
+        return self.information.sum(0), self.score.sum(0)
+
     def _cost(self, step: Array) -> float:
         """Return the cost of a step (n,) from the fit, up to a constant."""
-        return float(step @ (self.information.sum(0) @ step) - 2 * self.score.sum(0) @ step)
+        information, score = self._total
+        return float(step @ (information @ step) - 2 * score @ step)
 
     def _solved(self, free: Sequence[int], fixed: Array) -> Array:
         """Return the step (n,) of least cost in free places, from fixed ones."""
         places = list(free)
-        total = self.information.sum(0)
-        matrix = total[np.ix_(places, places)] + np.diag(self.prior[places])
+        information, score = self._total
+        matrix = information[np.ix_(places, places)] + np.diag(self.prior[places])
         step = fixed.copy()
-        step[places] += _inverse(matrix) @ (self.score.sum(0) - total @ fixed)[places]
+        step[places] += _inverse(matrix) @ (score - information @ fixed)[places]
         return step
 
 
@@ -196,13 +203,10 @@ def _placed(places: Sequence[int], values: Sequence[float], size: int) -> Array:
 def _scatter(information: Array, slopes: Array) -> tuple[float, int]:
     """Return Cochran's Q of numbers over episodes from their information (E, k, k) and slopes (E, k), and its dof."""
     size = np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
-    q, rank = 0.0, 0
-    for matrix, slope in zip(information, slopes, strict=True):
-        values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
-        kept = values > LEAST_SHARE
-        along = vectors[:, kept].T @ (slope / size)
-        q, rank = q + float((along**2 / values[kept]).sum()), rank + int(kept.sum())
-    return q, max(rank - len(size), 0)
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    along = ((slopes / size)[:, None] @ vectors)[:, 0]
+    kept = values > LEAST_SHARE
+    return float((along[kept] ** 2 / values[kept]).sum()), max(int(kept.sum()) - len(size), 0)
 
 
 def _inverse(matrix: Array) -> Array:
