@@ -27,6 +27,7 @@ Stage = Literal[
     "report9",
     "report10",
     "report11",
+    "report12",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on `development` alone. Each report stage is read once, after everything is fixed: the first

@@ -121,7 +121,7 @@ class FlightFindings:
         """Whether the selected effects imitate something else.
 
         Their parameters change from episode to episode, their law is another one, a law of any form explains more of
-        what repeats than they do, they leave nearly all that exceeds the noise, or what differs from episode to episode
+        what repeats than they do, they leave all that exceeds the noise, or what differs from episode to episode
         follows a law of the motion and they neither explain nearly all that the model lacks nor repeat with the same
         parameters.
         """
@@ -133,8 +133,7 @@ class FlightFindings:
         steady = self.predicts and self.agreement is not None and self.agreement.share >= LIMITS.consistent_share
         follows = self.own_law is not None and not (most or steady)
         other = bool(self.fleeting) or any(one.likelier for one in self.others)
-        little = self.explained_share <= LIMITS.useless_share
-        useless = bool(self.in_flight) and is_significant(self.after) and little
+        useless = bool(self.in_flight) and is_significant(self.after) and self.explained_share <= 0
         return inconsistent or imitated or follows or other or useless
 
 

@@ -329,15 +329,6 @@ class VerdictThresholds:
         "at odds of 2 and without these forms, real-like report10: 3 of 25 in no library get a wrong name, two of them "
         "drags above a speed, and 0 of 25 effects of flight and measurement, 15 of which get their own",
     )
-    useless_share: float = threshold(
-        0.1,
-        "1",
-        "effects in flight that leave a significant remainder, and explain no more than this share of what exceeds the "
-        "noise, imitate something else: `unexplained`",
-        "by argument: who names them says nothing of nine tenths of what is missing",
-        "real-like development: no true name goes (the least share beside a significant remainder is 0.42), of three "
-        "wrong ones that (0.017, 0.39, 0.79)",
-    )
     unlike_fall: tuple[float, float] = threshold(
         (0.5, 8.0),
         "weights, standard deviations",
