@@ -21,6 +21,9 @@ OPEN = 1.0
 """Standard deviation of a fitted coordinate from which on the motion leaves a parameter open."""
 APART = 1.0
 """Distance of the values of a loss that are tried, in logarithms."""
+FELT = 0.01
+"""Least change of a force by the losses that are tried, relative to the largest one, with which an interval shows how
+well they explain the forces."""
 ROUNDS = 10
 """Number of solutions, each with weights by the residuals of the one before."""
 
@@ -45,16 +48,20 @@ def loss_start(residuals: ForceResiduals, estimate: ContactEstimate, scale: floa
         tried = np.repeat(none[None], round((limits[k, 1] - limits[k, 0]) / APART) + 1, 0)
         tried[:, k] = np.linspace(limits[k, 0], limits[k, 1], len(tried))
         found = _rolled(residuals, tried)
-        best = int(robust_loss(found.square().sum(-1), scale)[0].sum(-1).argmin())
+        best = int(found.norm(dim=-1).sum(-1).argmin())  # not the robust loss, which knows no difference far from 0
         alone.append(((found[best] - base) / np.exp(tried[best, k])).flatten())
         sizes.append(np.exp(tried[best, k]))
     slopes, target = (torch.stack(alone, 1) * torch.tensor(sizes)).numpy(), -base.flatten().numpy()
+    size = np.linalg.norm(slopes.reshape(len(base), -1), axis=1)
+    matters = torch.as_tensor(size > FELT * size.max(initial=0.0))  # the others know nothing of the misfit
+    if not bool(matters.any()):
+        return None
     weight, factors = np.ones(len(base)), np.zeros(len(wide))
     for _ in range(ROUNDS):
         each = np.sqrt(weight).repeat(3)
         factors, _ = nnls(each[:, None] * slopes, each * target)
         left = torch.as_tensor((slopes @ factors - target).reshape(-1, 3)).square().sum(-1)
-        weight = robust_loss(left / max(float(left.median()), 1.0), scale)[1].numpy()
+        weight = robust_loss(left / max(float(left[matters].median()), 1.0), scale)[1].numpy()
     values = none.copy()
     values[wide] = np.log(np.maximum(factors * np.array(sizes), np.exp(limits[wide, 0])))
     return values.clip(limits[:, 0], limits[:, 1])

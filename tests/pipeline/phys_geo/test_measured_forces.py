@@ -20,12 +20,14 @@ from cgwm.pipeline.phys_geo.tracks.loss_start import loss_start
 from cgwm.pipeline.phys_geo.tracks.measured_forces import MeasuredForce, force_noise, measured_forces
 from cgwm.pipeline.phys_geo.tracks.multiple_shooting import Shooting, ShootingPrior
 from cgwm.pipeline.physics import Rollout, World
+from cgwm.pipeline.physics.chain_parameters import chain_parameters
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import Parameter, contact_parameters
 from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import FittedParameter, PhysConfig
+from helpers.chains import drawer
 from helpers.worlds import ball_body, batch, box_body, law, state_of, world_of
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -301,3 +303,59 @@ def test_forces_on_the_sensor_instead_of_by_the_finger_are_not_used() -> None:
     forces = measured_forces(world(), [turned], seen, FORCE_STD)
     found, record = with_forces(world(), prior, forces, seen, 1e-12 * torch.eye(12, dtype=torch.float64)[None])
     assert not record["used"] and record["unexplained"] > 0.9 and found is prior
+
+
+def test_starts_of_a_drawer_vary_along_its_rail_alone() -> None:
+    """Six numbers of its pose and six of its speed are measured, of which the rail admits one each."""
+    cabinet, start, _ = drawer(0.0)
+    index = cabinet.body_names.index("box")
+    seen: Any = SimpleNamespace(select=lambda rows: SimpleNamespace(state=start), free=[index])
+    generator = torch.Generator().manual_seed(0)
+    mixed = torch.randn(12, 12, generator=generator, dtype=torch.float64)
+    covariance = 1e-6 * mixed @ mixed.T
+    force: Any = SimpleNamespace(row=0)
+    root = ForceResiduals(cabinet, [], [force], seen, covariance[None]).roots[0]
+    assert root.shape == (12, 2)
+    along = [0, 6]  # place and speed along x
+    np.testing.assert_allclose((root @ root.T)[along][:, along], covariance[along][:, along], rtol=1e-4)
+
+
+def pushed_drawer(speed_m_s: float, name: str) -> Episode:
+    """A drawer of the engine, which a finger hits at a speed after 0.1 s, with the finger's force."""
+    rng, (cabinet, start, _) = np.random.default_rng(0), drawer(0.0)
+    times = np.arange(0, 0.501, 0.01)
+    path = np.stack((0.09 + speed_m_s * (0.1 - times), 0 * times, 0 * times), -1)
+    start.position_m[:, :, 2] = 0.0  # where the cabinet stands in a fit
+    upright = np.tile(UPRIGHT, (len(times), 1))
+    finger = Track(times, path, upright)
+    free = replace(cabinet, ground_normal=None, ground_offset=None, step_s=0.002)
+    motion = roll_out(free, start, torch.as_tensor(times), {"finger": finger}, True)
+    assert motion.contacts is not None
+    each = motion.contacts.impulse_n_s[0, 1:, motion.contacts.body_b == 2].sum(1).numpy() * 100
+    force = np.concatenate((0.5 * (each[1:] + each[:-1]), each[-1:]))  # of the intervals about the frames
+    force = np.concatenate((each[:1], force)) + 0.05 * rng.standard_normal((len(times), 3))
+    box = motion.position_m[0, :, 1].numpy() + 2e-4 * rng.standard_normal((len(times), 3))
+    case = Track(times, motion.position_m[0, :, 0].numpy(), upright)
+    return Episode(name, {"case": case, "box": Track(times, box, upright), "finger": replace(finger, force_n=force)})
+
+
+@pytest.mark.evidence  # in the suite: `test_losses_begin_at_what_the_forces_ask_for`
+def test_forces_tell_losses_in_a_joint_that_the_motion_leaves_open_over_decades() -> None:
+    """A damping of 8 N s/m and a friction of 2 N, from 0.15 and 0.15; each push begins with a hit."""
+    cabinet = replace(drawer(0.0)[0], ground_normal=None, ground_offset=None, step_s=0.002)
+    episodes = [pushed_drawer(0.2, "fast"), pushed_drawer(0.05, "slow")]
+    names = [*contact_parameters(cabinet), *chain_parameters(cabinet)]
+    known = ContactEstimate(
+        parameters=names,
+        values=np.array([np.log(0.15) if p.name.startswith("rail") else p.encode(p.prior[0]) for p in names]),
+        covariance=np.diag([p.prior[1] ** 2 for p in names]),
+    )
+    seen = Observations.of(cabinet, episodes, [(-1.0, 1.0)] * 2)
+    forces = measured_forces(cabinet, episodes, seen, 0.05)
+    start_cov = 1e-8 * torch.eye(12, dtype=torch.float64).repeat(2, 1, 1)
+    found, record = with_forces(cabinet, known, forces, seen, start_cov)
+    of = {p.name: (z, s) for p, z, s in zip(names, found.values, np.sqrt(np.diag(found.covariance)), strict=True)}
+    for name, true in (("rail.damping", 8.0), ("rail.friction", 2.0)):
+        value, error = of[name]
+        assert abs(value - np.log(true)) < 2.5 * error and error < 0.05
+    assert record["used"] and record["converged"]
