@@ -106,7 +106,8 @@ def ahead(agent: Agent, length: int, data: Sequences) -> tuple[Tensor, Tensor, T
         data: One sequence, at most as long.
     """
     frames = data.position_m.shape[1]
-    one = observed(data.chunk(torch.tensor([0]), torch.tensor([0]), length))  # the last frame is repeated
+    first = torch.zeros(1, dtype=torch.long, device=data.position_m.device)
+    one = observed(data.chunk(first, first, length))  # the last frame is repeated
     state, image = agent.imagine(one, DRAWS)
     mean = torch.as_tensor(state[:, :frames].mean(0), dtype=torch.float64)
     u, _, vt = torch.linalg.svd(mean[:, 3:12].unflatten(-1, (3, 3)))
