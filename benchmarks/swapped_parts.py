@@ -1,12 +1,13 @@
 """What of a fitted world costs its predictions: one part at a time is taken from the truth, after the fit.
 
     python benchmarks/swapped_parts.py run --seed 101 --tasks push --engines mujoco,rapier --objects box,l_block
+    python benchmarks/swapped_parts.py run --seed 103 --tasks push --engines mujoco,rapier,dart --damping 0.25,0.4,0.6
     python benchmarks/swapped_parts.py table
 
 Captures are those of `fall_push.py`; each is fitted once, and the ten test motions are predicted in the fitted world,
 in the true one under our law of contact (the floor), and in mixtures of both: shape, mass (with its centre and
 inertia), the two frictions, and the contact numbers (natural time and damping ratio) of the ground and of the
-fingertip.
+fingertip. With `--damping` the fingertip's damping ratio alone is also set to each of some values.
 `error_budget.py` gives the truth to the fit instead, which can then spend it on something else.
 """
 
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from cgwm.pipeline.demo.truth_tables import OBJECT
 from cgwm.pipeline.physics.contact_law import ContactLaw
 from cgwm.pipeline.physics.world import Body, World
@@ -47,8 +49,14 @@ class Job(Keyed):
     seed: int
 
 
-def measure(job: Job, work: Work) -> dict[str, Any]:
-    """Fit a capture, and return the errors of its tests (mm, deg) in every mixture of the fitted and the true world."""
+def measure(job: Job, work: Work, damping: Sequence[float] = ()) -> dict[str, Any]:
+    """Fit a capture, and return the errors of its tests (mm, deg) in every mixture of the fitted and the true world.
+
+    Args:
+        job: The capture.
+        work: Where things lie.
+        damping: Damping ratios of the fingertip that are tried in the fitted world.
+    """
     try:
         work.make_capture(job.task, job.object, job.material, job.engine)
         work.make_splats(job.task, job.object)
@@ -58,6 +66,7 @@ def measure(job: Job, work: Work) -> dict[str, Any]:
         return vars(job) | {"failed": error.found}
     learned, true = World.from_model(fitted.model), Floor().fit(cell, None).world
     worlds = {"fitted": learned, **{part: mixed(learned, true, (part,)) for part in PARTS}, "floor": true}
+    worlds |= {f"damping ratio {ratio:g}": damped(learned, true, ratio) for ratio in damping if true.pair_laws}
     errors = {name: _errors(world, judge) for name, world in worlds.items()}
     return vars(job) | {"fit": {"parameters": fitted.record["parameters"]}, "errors": errors}
 
@@ -73,6 +82,16 @@ def mixed(learned: World, true: World, parts: Sequence[str]) -> World:
         mine = learned.pair_laws.get(pair, learned.contact)
         pairs[pair] = _law(mine, law, "fingertip's friction" in parts, "fingertip's numbers" in parts)
     return replace(learned, bodies=tuple(bodies), contact=ground, pair_laws=pairs, ground_material=true.ground_material)
+
+
+def damped(learned: World, true: World, ratio: float) -> World:
+    """Return the learned world with another damping ratio of what its pairs of materials, the fingertip's, touch."""
+    world = mixed(learned, true, ())
+    laws = {
+        pair: replace(law, damping_ratio=torch.full_like(law.damping_ratio, ratio))
+        for pair, law in world.pair_laws.items()
+    }
+    return replace(world, pair_laws=laws)
 
 
 def _body(mine: Body, true: Body, parts: Sequence[str]) -> Body:
@@ -100,14 +119,16 @@ def _errors(world: World, judge: Judge) -> list[tuple[float, float]]:
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Return the medians of every capture in Markdown: mm / deg."""
     names = ["fitted", *PARTS, "floor"]
+    names += sorted({name for row in rows for name in row.get("errors", {})} - set(names))
     lines = ["| capture | " + " | ".join(names) + " |", "| --- " * (len(names) + 1) + "|"]
     for row in rows:
         words = f"{row['task']}, {row['object'].replace('_', '-')}, {row['material']}, {row['engine']}"
         if "failed" in row:
-            lines.append(f"| {words} | failed: {row['failed']} |" + " |" * len(PARTS))
+            lines.append(f"| {words} | failed: {row['failed']} |" + " |" * (len(names) - 1))
             continue
         middle = {name: np.median(np.array(values), axis=0) for name, values in row["errors"].items()}
-        lines.append(f"| {words} | " + " | ".join(f"{middle[n][0]:.1f} / {middle[n][1]:.1f}" for n in names) + " |")
+        cells = [f"{middle[n][0]:.1f} / {middle[n][1]:.1f}" if n in middle else "–" for n in names]
+        lines.append(f"| {words} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -120,6 +141,7 @@ def main() -> int:
     parser.add_argument("--materials", default=",".join(MATERIALS))
     parser.add_argument("--engines", default="mujoco,rapier")
     parser.add_argument("--seed", type=int, default=101)
+    parser.add_argument("--damping", default="", help="damping ratios of the fingertip to try, separated by commas")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--folder", type=Path, default=Path("out") / "swapped_parts", help="captures and models")
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
@@ -128,10 +150,11 @@ def main() -> int:
     store = Store("swapped_parts", given.store, given.any_commit)
     if given.what == "run":
         work = Work(given.folder.resolve(), given.seed, given.device, psnr_every=10)
+        damping = [float(one) for one in given.damping.split(",") if one]
         kinds = [getattr(given, name).split(",") for name in ("tasks", "objects", "materials", "engines")]
         for kind in itertools.product(*kinds):
             job = Job(*kind, given.seed)
-            store.result(job.key, lambda job=job: measure(job, work))
+            store.result(job.key, lambda job=job: measure(job, work, damping))
     print(table(store.results()))
     return 0
 
