@@ -53,8 +53,8 @@ PRIOR_MEAN, PRIOR_STD = np.array([0.0, 0.0, 0.6, 0.2]), np.array([0.5, 0.5, 0.5,
 that reflects some light."""
 SIDE_STD = 0.05
 """Relative error of a side's brightness in a frame, whose texture differs slightly from the photos'."""
-SIDES_PER_FRAME = 3.0
-"""Number of independent blocks in a frame; errors of blocks on one side are correlated."""
+SIDE_DEG, SIDE_BLOCKS = 20.0, 4
+"""Largest angle between the normals of a side's blocks and that in their middle, and the fewest blocks of a side."""
 IRLS_STEPS = 20
 """Number of iterations of re-weighted least squares."""
 FACING = 0.15
@@ -104,10 +104,11 @@ def learn_appearance(
     frames = _frames(model, capture, exposures, split, found)
     seen = {name: _seen(model, capture, name) for name in {model.file.bodies[frame.body].name for frame in frames}}
     rows = [row for frame in frames if (row := _ratios(model, frame, seen)) is not None]
-    if sum(len(ratio) for ratio, _, _ in rows) < MIN_BLOCKS:
+    sides = [side for row in rows for side in _sides(*row)]
+    if sum(len(ratio) for ratio, _, _ in rows) < MIN_BLOCKS or not sides:
         return model
-    ratio, now, photo = (np.concatenate([row[k] for row in rows]) for k in range(3))
-    light = fit_light(ratio, now, photo, SIDES_PER_FRAME * len(rows))
+    ratio, now, photo = (np.stack([side[k] for side in sides]) for k in range(3))
+    light = fit_light(ratio, now, photo, len(ratio))
     splats, collision = dict(model.body_splats), dict(model.collision)
     for index, body in enumerate(model.file.bodies):
         mine = [frame for frame in frames if frame.body == index]
@@ -285,6 +286,23 @@ def _ratios(model: Model, frame: _Frame, seen: dict[str, NDArray[np.bool_]]) -> 
     direction = blocks[kept, 2:5] / length[kept, None]
     resting = quat_to_matrix(torch.tensor(body.photo_pose.quat_wxyz, dtype=torch.float64)).numpy()
     return blocks[kept, 0] / blocks[kept, 1], direction @ frame.rotation.numpy().T, direction @ resting.T
+
+
+def _sides(ratio: Array, now: Array, photo: Array) -> list[tuple[Array, Array, Array]]:
+    """Return the sides of a body in a frame: median ratio () and mean normals (3,) of blocks that face alike.
+
+    The normals of single spheres are off by some degrees. A strong lamp makes much of that, so that a fit to single
+    blocks would take it for weak (errors of a regressor attenuate its coefficient); in the mean of a side they cancel.
+    """
+    left, found = np.arange(len(ratio)), []
+    while len(left):
+        alike = photo[left] @ photo[left].T > math.cos(math.radians(SIDE_DEG))
+        chosen = alike[alike.sum(1).argmax()]
+        side, left = left[chosen], left[~chosen]
+        if len(side) >= SIDE_BLOCKS:
+            means = (normals[side].mean(0) for normals in (now, photo))
+            found.append((np.median(ratio[side]), *(mean / np.linalg.norm(mean) for mean in means)))
+    return found
 
 
 def _pictured(splats: Splats, frame: _Frame, features: Array) -> tuple[Array, Array]:
