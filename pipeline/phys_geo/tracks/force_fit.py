@@ -17,6 +17,7 @@ both.
 
 Losses in joints are known to decades before. Descents begin at what the forces ask for (`loss_start.py`), too, and
 where they end in two minima that are both probable, the interval holds both.
+Where forces leave a loss open, what it may take from the others widens their intervals.
 
 The estimate of a search of many episodes counts with the spread of all samples that predict the motion about as well,
 as a density that holds over its whole width: the inverse of the scatter between episodes can claim that combinations of
@@ -48,7 +49,7 @@ from ...physics.world import World
 from ...trajectories.observations import Observations
 from .contact_result import ContactEstimate
 from .force_residuals import ForceResiduals
-from .loss_start import loss_start
+from .loss_start import OPEN, loss_start
 from .measured_forces import MeasuredForce
 
 ROBUST_SCALE = 4.0
@@ -74,6 +75,8 @@ MEDIAN_CHI2 = 2.366
 """Median of chi-square with 3 degrees of freedom."""
 MANY_EPISODES = 8
 """Number of episodes from which on their scatter counts."""
+END = 1.96
+"""End of an interval, in standard errors."""
 LEAST_POSTERIOR = 1e-3
 """Least share of the posterior, relative to that of the best minimum, with which another one widens intervals."""
 MOST_UNEXPLAINED = 0.5
@@ -129,9 +132,9 @@ def with_forces(
     }
     if not record["used"]:
         return estimate, record
-    values, covariance = (slow.values, slow.covariance + np.diag(excess)) if excess.any() else (
-        fast.values, fast.covariance)  # fmt: skip
-    return replace(estimate, values=values, covariance=covariance, spread=None), record
+    used, more = (slow, excess) if excess.any() else (fast, np.zeros_like(excess))
+    covariance = used.covariance + np.diag(more + _bent(used))
+    return replace(estimate, values=used.values, covariance=covariance, spread=None), record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,6 +217,27 @@ def _mixed(modes: Sequence[_Mode]) -> NDArray[np.float64]:
     return np.sum(parts, 0)
 
 
+def _bent(told: _Told) -> NDArray[np.float64]:
+    """Return variances (P,) by which others follow a parameter that stays open, beyond what the covariance says.
+
+    A small loss in a joint hardly changes the force; ten times as much takes the place of another one. So the
+    parameter is held at both ends of its interval, and the others descend.
+    """
+    problem, start = told.problem, told.points[0]
+    std, more = np.sqrt(np.diag(told.covariance)), np.zeros(len(told.covariance))
+    for k in np.flatnonzero(std > OPEN):
+        for side in (-END, END):
+            moved = start.values.clone()
+            moved[:, k] = problem.box.clamped(moved + side * std[k])[:, k]
+            held = problem.held(int(k), float(moved[0, k]))
+            end = descend(held, replace(start, values=moved), POLICY).point
+            off = (end.values - start.values)[0].numpy() / END
+            beyond = np.square(off) - np.square(told.covariance[k]) / told.covariance[k, k]
+            beyond[k] = 0.0
+            more = np.maximum(more, beyond)
+    return more
+
+
 def _excess(slow: _Told, fast: _Told) -> NDArray[np.float64]:
     """Return the squared difference (P,) of two estimates beyond chance, of which the second knows more."""
     before, after = np.diag(slow.covariance), np.diag(fast.covariance)
@@ -244,6 +268,14 @@ class _ForceProblem(Problem):
     def scaled(self, scale: float, repeats: float = 1.0) -> _ForceProblem:
         """Return the problem with another scale and number of residuals that go together."""
         return _ForceProblem(self.residuals, self.estimate, scale, repeats)
+
+    def held(self, parameter: int, value: float) -> _ForceProblem:
+        """Return the problem with one parameter held at a value."""
+        problem = self.scaled(self.scale, self.repeats)
+        low, high = problem.box.low.clone(), problem.box.high.clone()
+        low[:, parameter] = high[:, parameter] = value
+        problem.box = replace(problem.box, low=low, high=high)
+        return problem
 
     def cost(self, point: Point) -> float:
         """Return the cost of a point."""

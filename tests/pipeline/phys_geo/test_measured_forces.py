@@ -14,7 +14,7 @@ from cgwm.pipeline.geometry.rotation import quat_conjugate, quat_log, quat_multi
 from cgwm.pipeline.optimization.problem import Point
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
 from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate, FitRecord, PhysicsFit, physics_fit
-from cgwm.pipeline.phys_geo.tracks.force_fit import _excess, _mixed, with_forces
+from cgwm.pipeline.phys_geo.tracks.force_fit import _bent, _excess, _mixed, _told, with_forces
 from cgwm.pipeline.phys_geo.tracks.force_residuals import ForceResiduals
 from cgwm.pipeline.phys_geo.tracks.loss_start import loss_start
 from cgwm.pipeline.phys_geo.tracks.measured_forces import MeasuredForce, force_noise, measured_forces
@@ -359,3 +359,42 @@ def test_forces_tell_losses_in_a_joint_that_the_motion_leaves_open_over_decades(
         value, error = of[name]
         assert abs(value - np.log(true)) < 2.5 * error and error < 0.05
     assert record["used"] and record["converged"]
+
+
+class OneSpeed:
+    """Residuals of forces at one speed, which show a sum of friction and damping alone; the start changes nothing."""
+
+    start_size = 1
+    forces = (None,)
+    unexplained = staticmethod(lambda residuals: 0.0)
+    repeats = staticmethod(lambda residuals, most: 1.0)
+
+    def of(self, episode: int, values: torch.Tensor, starts: torch.Tensor) -> torch.Tensor:
+        del episode, starts
+        damping, friction = values.exp().unbind(1)
+        off = ((friction + 0.04 * damping - 2.32) / 0.05)[:, None, None]
+        return torch.nn.functional.pad(off.expand(-1, 80, 1), (0, 2))
+
+    def derivatives(self, episode: int, values: torch.Tensor, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        steps = 1e-5 * torch.eye(2, dtype=torch.float64)
+        every = self.of(episode, torch.cat((values[None], values + steps)), start)
+        return every[0], torch.nn.functional.pad(((every[1:] - every[0]) / 1e-5).movedim(0, -1), (0, 1))
+
+
+def test_a_friction_is_as_open_as_the_damping_that_may_take_its_place() -> None:
+    """8 N s/m and 2 N have the same force as almost no damping and 2.32 N, of which the prior takes the latter."""
+    known = ContactEstimate(
+        parameters=[loss("rail.damping"), loss("rail.friction")],
+        values=np.log([0.15, 0.15]),
+        covariance=np.diag([1.5**2, 1.5**2]),
+    )
+    residuals: Any = OneSpeed()
+    start = Point(values=torch.log(batch([0.15, 2.0])), states=(torch.zeros(2, 1, dtype=torch.float64),))
+    found = _told(residuals, known, [start])
+    plain = np.sqrt(found.covariance[1, 1])
+    wider = np.sqrt(found.covariance[1, 1] + _bent(found)[1])
+    assert np.sqrt(found.covariance[0, 0]) > 1.3 and _bent(found)[0] == 0.0
+    off = abs(found.values[1] - np.log(2.32))
+    assert off < 0.01 and plain < 0.01
+    held = 2.32 - 0.04 * np.exp(found.values[0] + 1.96 * np.sqrt(found.covariance[0, 0]))  # at the end of its interval
+    np.testing.assert_allclose(wider, (found.values[1] - np.log(held)) / 1.96, rtol=0.05)
