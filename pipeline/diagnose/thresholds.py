@@ -326,8 +326,9 @@ class VerdictThresholds:
         "library (46 of them what acts on one side of a speed, or swings) 11 get a wrong name at odds of 2 and 7 at 4, "
         "and 26 and 25 of 36 true effects that move the body by 10 slow errors or more get theirs; without forms that "
         "act on one side of a speed or swing 13 and 26 at odds of 2",
-        "at odds of 2 and without these forms, real-like report10: 3 of 25 in no library get a wrong name, two of them "
-        "drags above a speed, and 0 of 25 effects of flight and measurement, 15 of which get their own",
+        "real-like report11 and report12: 1 of 36 in no library get a wrong name, and 0 of 48 effects of flight and "
+        "measurement, 19 of which get their own; at odds of 2 and without these forms, report10: 3 of 25, and 0 and 15 "
+        "of 25",
     )
     unlike_fall: tuple[float, float] = threshold(
         (0.5, 8.0),
