@@ -204,6 +204,11 @@ class Structure:
         return self.on_lanes(2 * lanes if lanes < THREADS else 1)
 
     @property
+    def contact_bytes(self) -> int:
+        """Least size of a thread's list of contacts: of each an arm, an impulse and three numbers, of pairs more."""
+        return (16 if self.paired else 9) * (4 if self.single else 8) * self.slots
+
+    @property
     def slots(self) -> int:
         """Number of contacts per thread."""
         return max(1, -(-self.contacts // self.lanes))

@@ -15,12 +15,14 @@ from cgwm.pipeline.physics.chain_state import with_joints
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.fused import simulate_fused
+from cgwm.pipeline.physics.fused.launch import require_room
 from cgwm.pipeline.physics.fused.packing import pack, reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import SHARED_BYTES, Structure
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.runtime import kernel_build
+from cgwm.schemas import UsageError
 from helpers import fused_host
 from helpers.chains import chained, double_pendulum, drawer, link, still
 from helpers.worlds import F64, ball_body, batch, times
@@ -240,6 +242,16 @@ def test_environments_of_a_block_are_as_many_as_its_memory_holds() -> None:
     assert [middle.on_lanes(lanes).lanes for lanes in (1, 4, 32)] == [1, 8, 32]
     assert middle.on_lanes(4).block_bytes <= SHARED_BYTES < 8 * middle.on_lanes(4).shared_bytes
     assert endless.on_lanes(32).lanes == 1 and not endless.on_lanes(32).shared
+
+
+def test_more_contacts_than_a_thread_has_room_for_are_refused() -> None:
+    """A LEAP hand whose fingers touch each other has 11,880 possible contacts, and one copy no room in a block."""
+    pairs = tuple((0, 1, 60) for _ in range(198))
+    hand = replace(long_chain(2), pairs=pairs)
+    with pytest.raises(UsageError, match=r"may have 11880 contacts at once.*up to 4096\..*--device cpu") as refused:
+        require_room(hand)
+    assert refused.value.exit_code == 2
+    require_room(replace(hand, pairs=pairs[:60]))
 
 
 def test_a_hand_of_160_spheres_and_two_objects_of_250_stay_in_the_kernel() -> None:
