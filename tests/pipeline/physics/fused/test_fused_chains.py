@@ -248,7 +248,7 @@ def test_more_contacts_than_a_thread_has_room_for_are_refused() -> None:
     """A LEAP hand whose fingers touch each other has 11,880 possible contacts, and one copy no room in a block."""
     pairs = tuple((0, 1, 60) for _ in range(198))
     hand = replace(long_chain(2), pairs=pairs)
-    with pytest.raises(UsageError, match=r"may have 11880 contacts at once.*up to 4096\..*--device cpu") as refused:
+    with pytest.raises(UsageError, match=r"(?s)may have 11880 contacts at once.*up to 4096\..*--device cpu") as refused:
         require_room(hand)
     assert refused.value.exit_code == 2
     require_room(replace(hand, pairs=pairs[:60]))
