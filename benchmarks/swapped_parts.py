@@ -152,8 +152,8 @@ def main() -> int:
         work = Work(given.folder.resolve(), given.seed, given.device, psnr_every=10)
         damping = [float(one) for one in given.damping.split(",") if one]
         kinds = [getattr(given, name).split(",") for name in ("tasks", "objects", "materials", "engines")]
-        for kind in itertools.product(*kinds):
-            job = Job(*kind, given.seed)
+        for task, name, material, engine in itertools.product(*kinds):
+            job = Job(task, name, material, engine, given.seed)
             store.result(job.key, lambda job=job: measure(job, work, damping))
     print(table(store.results()))
     return 0
