@@ -245,7 +245,14 @@ def _force_warnings(told: Mapping[str, Any]) -> list[str]:
             "as where a hit does not follow the contact law: the estimates are those of the long intervals, and their "
             "intervals hold both. Motions that begin in contact and without a hit would tell them apart."
         )
-    if told["information_over"] > DISTURBED:
+    if not told["described"]:
+        found.append(
+            f"the model's forces differ from the measured ones by {told['misfit'] ** 0.5:.2g} times their noise on "
+            "short intervals: the contact has another law, or the path of the driven body has noise. The estimates are "
+            "those of long intervals, and may be off by more than their intervals; a fit with another --seed shows "
+            "some of it. Motions that begin in contact, without a hit, follow the law better."
+        )
+    elif told["information_over"] > DISTURBED:
         found.append(
             "the measured forces differ from the model's by more than their noise: intervals are "
             f"{told['information_over'] ** 0.5:.2g} times as wide as the noise alone would make them."

@@ -13,7 +13,7 @@ The forces of short intervals have minima far from the truth, where contact sets
 measured. So the descent begins with mean forces on long intervals: what contact exchanges there follows from the change
 of momentum, whatever its law. From their minimum the short intervals go on. Where the two differ by more than chance
 (Hausman, 1978), contact does not follow its law: the estimate is that of the long intervals, and its interval holds
-both.
+both. Where no parameters make the short intervals follow the model to within their noise, they do not count at all.
 
 Losses in joints are known to decades before. Descents begin at what the forces ask for (`loss_start.py`), too, and
 where they end in two minima that are both probable, the interval holds both.
@@ -82,6 +82,8 @@ LEAST_POSTERIOR = 1e-3
 MOST_UNEXPLAINED = 0.5
 """Largest typical difference of the model's forces from the measured ones, relative to these, with which they are
 used."""
+MOST_MISFIT = 2.0
+"""Largest median chi-square of short intervals, relative to its expectation from the noise, with which they count."""
 APART, LEAST_APART = 3.84, 0.1
 """Squared difference of the estimates by long and by short intervals that is chance, in units of its variance: 95 % of
 a chi-square; and the least such variance, as a share of that by long intervals."""
@@ -128,11 +130,13 @@ def with_forces(
         },
         "unexplained": slow.unexplained,
         "used": slow.unexplained <= MOST_UNEXPLAINED,
+        "described": fast.misfit <= max(MOST_MISFIT, slow.misfit),
         "apart": [p.name for p, beyond in zip(estimate.parameters, excess, strict=True) if beyond > 0],
     }
     if not record["used"]:
         return estimate, record
-    used, more = (slow, excess) if excess.any() else (fast, np.zeros_like(excess))
+    described = record["described"] and not excess.any()
+    used, more = (fast, np.zeros_like(excess)) if described else (slow, excess)
     covariance = used.covariance + np.diag(more + _bent(used))
     return replace(estimate, values=used.values, covariance=covariance, spread=None), record
 

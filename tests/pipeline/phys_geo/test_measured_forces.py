@@ -274,7 +274,8 @@ def test_what_the_model_leaves_unexplained_is_relative_to_the_forces() -> None:
 
 
 def told(**changes: Any) -> dict[str, Any]:
-    return {"used": True, "unexplained": 0.01, "apart": [], "information_over": 1.0, "converged": True} | changes
+    usual = {"used": True, "unexplained": 0.01, "apart": [], "misfit": 1.0, "described": True, "information_over": 1.0}
+    return usual | {"converged": True} | changes
 
 
 @pytest.mark.parametrize(
@@ -283,6 +284,7 @@ def told(**changes: Any) -> dict[str, Any]:
         (told(), None),
         (told(used=False, unexplained=1.02), "the measured forces are not used: the model's differ from them by 102 %"),
         (told(apart=["contact_time_s"]), "on short and on long intervals ask for different values of contact_time_s"),
+        (told(misfit=9.0, described=False, information_over=90.0), "by 3 times their noise on short intervals"),
         (told(information_over=9.0), "intervals are 3 times as wide as the noise alone would make them"),
     ],
 )
