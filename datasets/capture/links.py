@@ -54,16 +54,14 @@ def _read(root: Path, entry: Entry) -> Articulation:
         )
     if not moving:
         raise InputDataError(f"{path}: none of its joints moves.", todo="make it one of [[bodies]] with a shape.")
-    still = {} if entry.base == "free" else {found.links[0].name}
     for link in found.links:
-        if link.name not in still:
-            _require_link(path, link)
+        _require_link(path, link, moves=entry.base == "free" or link is not found.links[0])
     return found
 
 
-def _require_link(path: Path, link: LinkOfRobot) -> None:
-    """Refuse a link that moves and has no mass or nothing that could touch."""
-    if not link.mass_kg > 0:
+def _require_link(path: Path, link: LinkOfRobot, moves: bool) -> None:
+    """Refuse a link that has nothing that could touch, or that moves and has no mass."""
+    if moves and not link.mass_kg > 0:
         raise InputDataError(
             f"{path}: link '{link.name}' moves and has no mass.", "<inertial> with a mass above 0 kg.", "add it."
         )

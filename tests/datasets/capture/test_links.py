@@ -73,6 +73,16 @@ def test_files_that_are_no_chain_are_refused(tmp_path: Path, old: str, new: str,
         capture(tmp_path, urdf)
 
 
+def test_a_fixed_root_link_without_collision_geometry_is_refused(tmp_path: Path) -> None:
+    mjcf = """<mujoco><worldbody><body name="case"><inertial mass="5" pos="0 0 0" diaginertia="0.1 0.1 0.1"/>
+      <body name="drawer"><joint name="rail" type="slide" axis="1 0 0"/>
+      <geom type="box" size="0.05 0.02 0.02" mass="0.3"/></body></body></worldbody></mujoco>"""
+    (tmp_path / "arm.xml").write_text(mjcf)
+    manifest = MANIFEST.replace('urdf = "arm.urdf"', 'mjcf = "arm.xml"\nbase = "fixed"\npose = {}')
+    with pytest.raises(InputDataError, match="link 'case' has no collision geometry"):
+        capture(tmp_path, manifest=manifest)
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
