@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
@@ -127,12 +128,33 @@ def drawer(rng: np.random.Generator) -> list[str]:
     return found.rows
 
 
-def capture(folder: Path, body: str, urdf: str, motions: list[list[str]]) -> Path:
-    """Write a capture of a jointed body on a fixed root, all of whose episodes are for the fit."""
+def write_tracks(folder: Path, motions: list[list[str]]) -> list[str]:
+    """Write the tracks of a capture, and return the names of their episodes."""
     (folder / "tracks").mkdir(parents=True, exist_ok=True)
     names = [f"{k:03d}" for k in range(len(motions))]
     for name, rows in zip(names, motions, strict=True):
         (folder / "tracks" / f"{name}.csv").write_text("\n".join(rows) + "\n")
+    return names
+
+
+def print_found(model: Path, truth: Mapping[str, float], more: Mapping[str, float]) -> None:
+    """Print what a fit found of parameters whose true values are known, one JSON line each, with more numbers."""
+    fitted = {p.name: p for p in read_model(model).file.parameters}
+    for name, value in truth.items():
+        one = fitted[name]
+        row = {
+            "parameter": name,
+            "true": value,
+            "estimate": one.estimate,
+            "interval_95": one.interval_95 and list(one.interval_95),
+            "state": one.state,
+        }
+        print(json.dumps({**row, **more}), flush=True)
+
+
+def capture(folder: Path, body: str, urdf: str, motions: list[list[str]]) -> Path:
+    """Write a capture of a jointed body on a fixed root, all of whose episodes are for the fit."""
+    names = write_tracks(folder, motions)
     (folder / "body.urdf").write_text(urdf)
     (folder / "capture.toml").write_text(
         f'{HEAD}{body}[[articulations]]\nname = "jointed"\nurdf = "body.urdf"\nbase = "fixed"\n'
@@ -159,16 +181,8 @@ def main() -> None:
             continue
         made = capture(given.folder / name, body, urdf, motions)
         fit(made, given.folder / f"{name}_model", overwrite=True)
-        fitted = {p.name: p for p in read_model(given.folder / f"{name}_model").file.parameters}
-        for key, value in {f"{joint}.{number}": value for number, value in truth.items()}.items():
-            one = fitted[key]
-            row = {
-                "parameter": key,
-                "true": value,
-                "estimate": one.estimate,
-                "interval_95": one.interval_95 and list(one.interval_95),
-            }
-            print(json.dumps({**row, "state": one.state}), flush=True)
+        known = {f"{joint}.{number}": value for number, value in truth.items()}
+        print_found(given.folder / f"{name}_model", known, {})
 
 
 if __name__ == "__main__":

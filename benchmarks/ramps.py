@@ -17,9 +17,8 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from cgwm.datasets import read_model
 from cgwm.pipeline.fit import fit
-from joints import EVERY, STEP_S, Recorder
+from joints import EVERY, STEP_S, Recorder, print_found, write_tracks
 from scipy.spatial.transform import Rotation
 
 SLOPE_RAD = math.radians(24.0)
@@ -71,10 +70,7 @@ def slide(rng: np.random.Generator, model: mujoco.MjModel, ramp: str) -> list[st
 
 def capture(folder: Path, motions: list[list[str]]) -> Path:
     """Write a capture of the slides, all of which are for the fit."""
-    (folder / "tracks").mkdir(parents=True, exist_ok=True)
-    names = [f"{k:03d}" for k in range(len(motions))]
-    for name, rows in zip(names, motions, strict=True):
-        (folder / "tracks" / f"{name}.csv").write_text("\n".join(rows) + "\n")
+    names = write_tracks(folder, motions)
     lines = ['format = "cgwm-capture/1"', "[world]", "gravity_m_s2 = [0.0, 0.0, -9.81]"]
     lines += [f'[[materials]]\nname = "{name}"' for name in ("plastic", *RAMPS)]
     lines += [
@@ -108,16 +104,8 @@ def main() -> None:
     began = time.perf_counter()
     fit(made, given.folder / "model", overwrite=True)
     seconds = round(time.perf_counter() - began, 1)
-    fitted = {p.name: p for p in read_model(given.folder / "model").file.parameters}
-    for name, value in truth.items():
-        one = fitted[f"friction[plastic,{name}]"]
-        row = {
-            "parameter": one.name,
-            "true": value,
-            "estimate": one.estimate,
-            "interval_95": one.interval_95 and list(one.interval_95),
-        }
-        print(json.dumps({**row, "state": one.state, "seconds": seconds}), flush=True)
+    known = {f"friction[plastic,{name}]": value for name, value in truth.items()}
+    print_found(given.folder / "model", known, {"seconds": seconds})
 
 
 if __name__ == "__main__":
