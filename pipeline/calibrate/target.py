@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,6 +80,17 @@ def calibrate_target(folder: Path | str, overwrite: bool = False) -> IntrinsicsF
     return file
 
 
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """Have OpenCV work in the calling thread alone, and afterwards in as many as before."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
 def _text(file: IntrinsicsFile) -> str:
     return file.model_dump_json(indent=1) + "\n"
 
@@ -143,14 +155,11 @@ def _fitted(seen: Sequence[_Seen], size: tuple[int, int]) -> _Fit:
     boards = [one.board_mm.astype(np.float32) for one in seen]
     pixels = [one.pixels.astype(np.float32)[:, None] for one in seen]
     K, lens = np.eye(3), np.zeros(5)
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # sums of several threads differ in the last digits from run to run
     try:
-        _, K, lens, _, _, stds, _, errors = cv2.calibrateCameraExtended(boards, pixels, size, K, lens, flags=_LENS)
+        with one_opencv_thread():  # sums of several differ in the last digits from run to run
+            _, K, lens, _, _, stds, _, errors = cv2.calibrateCameraExtended(boards, pixels, size, K, lens, flags=_LENS)
     except cv2.error as error:
         raise _no_camera(str(error.err)) from None
-    finally:
-        cv2.setNumThreads(threads)
     values = np.concatenate([np.ravel(K), np.ravel(lens)[:4], np.ravel(stds)[:8]])
     if not np.isfinite(values).all() or min(K[0, 0], K[1, 1]) <= 0:
         raise _no_camera("the fit diverged")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.calibrate.target import one_opencv_thread
 from cgwm.pipeline.phys_geo.images import pose_search, pose_tracking
 from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
@@ -86,7 +87,8 @@ def _mask_videos(folder: Path) -> Command:
 
 
 def _target(folder: Path) -> Command:
-    write_photos(folder / "board", 9)
+    with one_opencv_thread():  # a command that is forked from here would wait for threads that it has not
+        write_photos(folder / "board", 9)
     out = "board/intrinsics.json"
     words = ["calibrate", str(folder / "board"), "--target", "charuco"]
     return Command(words=words, out=(out,), check=(["validate", str(folder / out)],))

@@ -43,7 +43,6 @@ def write_photos(folder: Path, count: int, seed: int = 0) -> None:
     drawn, rng = sheet(), np.random.default_rng(seed)
     margin = 0.5 * (np.array(SHEET_MM) - [COLUMNS * SQUARE_MM, ROWS * SQUARE_MM])
     pixels = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).reshape(-1, 1, 2).astype(float)
-    cv2.setNumThreads(1)  # a command that is forked from here would wait for threads that it has not
     rays = cv2.undistortPoints(pixels, K, LENS).reshape(-1, 2)
     for k, (turn, shift) in enumerate(poses(count, seed)):
         to_camera = np.column_stack([cv2.Rodrigues(turn)[0][:, :2], shift])
