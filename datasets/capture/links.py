@@ -65,12 +65,7 @@ def _require_link(path: Path, link: LinkOfRobot, moves: bool) -> None:
         raise InputDataError(
             f"{path}: link '{link.name}' moves and has no mass.", "<inertial> with a mass above 0 kg.", "add it."
         )
-    if not link.geometry:
-        raise InputDataError(
-            f"{path}: link '{link.name}' has no collision geometry, so nothing could touch it.",
-            "a box, sphere, cylinder or mesh: <collision> of a URDF, a <geom> of an MJCF that collides.",
-            "add one.",
-        )
+    link.require_geometry(path, "add one.")
 
 
 def with_links(root: Path, manifest: CaptureManifest) -> CaptureManifest:

@@ -49,6 +49,23 @@ class LinkOfRobot:
     geometry: tuple[GeometryOfLink, ...]
     """What collides; empty for a link that nothing touches."""
 
+    def require_geometry(self, path: Path, todo: str) -> None:
+        """Check that the link has collision geometry.
+
+        Args:
+            path: The file of the robot.
+            todo: What to do next where it has none.
+
+        Raises:
+            InputDataError: If it has none.
+        """
+        if not self.geometry:
+            raise InputDataError(
+                f"{path}: link '{self.name}' has no collision geometry, so nothing could touch it.",
+                "a box, sphere, cylinder or mesh: <collision> of a URDF, a <geom> of an MJCF that collides.",
+                todo,
+            )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointOfRobot:
@@ -161,12 +178,8 @@ class Articulation:
             InputDataError: If one has none.
         """
         for link in self.links:
-            if link.mass_kg > 0 and not link.geometry:
-                raise InputDataError(
-                    f"{self.path}: link '{link.name}' has no collision geometry, so nothing could touch it.",
-                    "a box, sphere, cylinder or mesh: <collision> of a URDF, a <geom> of an MJCF that collides.",
-                    "add one, or ask for links without it by bare_links=True.",
-                )
+            if link.mass_kg > 0:
+                link.require_geometry(self.path, "add one, or ask for links without it by bare_links=True.")
 
     def require_metres(self) -> None:
         """Check that no mesh is far too large, as one in millimetres is.
