@@ -49,8 +49,6 @@ class SearchResult:
     """Covariance (P, P) of the tempered posterior."""
     lowest: float
     """Lowest mean cost over episodes."""
-    prior: NormalPrior
-    """The prior."""
     samples: Array
     """All samples (N, P)."""
     costs: Array
@@ -123,7 +121,6 @@ def importance_search(
         mean=mean,
         covariance=covariance,
         lowest=history[-1],
-        prior=prior,
         samples=samples,
         costs=found,
         log_ratio=log_ratio,

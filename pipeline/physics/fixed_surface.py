@@ -69,7 +69,7 @@ class FixedSurface:
         local = self.local(points)
         if self.mesh is None:
             return self.distances(local)[0]
-        low, high = (torch.as_tensor(x).to(points) for x in self.mesh.bounds)
+        low, high = self.extent
         return torch.maximum(low - local, local - high).clamp_min(0.0).square().sum(-1).sqrt()
 
     @property

@@ -16,8 +16,8 @@ of momentum, whatever its law. From their minimum the short intervals go on. Whe
 both. Where no parameters make the short intervals follow the model to within their noise, they do not count at all.
 
 Losses in joints are known to decades before. Descents begin at what the forces ask for (`loss_start.py`), too, and
-where they end in two minima that are both probable, the interval holds both.
-Where forces leave a loss open, what it may take from the others widens their intervals.
+where they end in two minima that are both probable, the interval holds both. Where forces leave a loss open, what it
+may take from the others widens their intervals.
 
 The estimate of a search of many episodes counts with the spread of all samples that predict the motion about as well,
 as a density that holds over its whole width: the inverse of the scatter between episodes can claim that combinations of
@@ -106,8 +106,8 @@ def with_forces(
         start_cov: Covariance (E, 12 nf, 12 nf) of these states.
     """
     wide = estimate if estimate.spread is None else replace(estimate, covariance=estimate.spread)
-
-    long = ForceResiduals(world, estimate.parameters, [force.slow() for force in forces], observations, start_cov)
+    averaged = [force.slow() for force in forces]
+    long = ForceResiduals(world, estimate.parameters, averaged, observations, start_cov)
     short = ForceResiduals(world, estimate.parameters, forces, observations, start_cov)
     first = _ForceProblem(long, wide).start()
     losses = loss_start(long, wide, ROBUST_SCALE)
@@ -123,7 +123,7 @@ def with_forces(
         "information_over": fast.problem.scale * fast.problem.repeats,
         "converged": fast.converged,
         "long_intervals": {
-            "intervals": sum(len(force.slow().force_n) for force in forces),
+            "intervals": sum(len(force.force_n) for force in averaged),
             "misfit": slow.misfit,
             "information_over": slow.problem.scale * slow.problem.repeats,
             "converged": slow.converged,
