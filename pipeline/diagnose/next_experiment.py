@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...schemas import NextExperiment
 from ..physics.world import World
 from ..report.page import listed
-from ..segments.candidates import Variant, variants_of
+from ..segments.candidates import Variant, variants_of, without_effect
 from ..segments.prepare import Prepared
 from .evidence import Evidence
 from .experiments import Experiment, described
@@ -105,12 +105,12 @@ def rivals_of(findings: Findings) -> Rivals | None:
         return None
     for one in shared:
         if len(one.equals) > 1:
-            return Rivals(one.equals, _without(findings.world, one.evidence.name))
+            return Rivals(one.equals, without_effect(findings.world, one.evidence.name))
     first = shared[0]
     second = _second_in_contact(findings) if first.where == "contact" else _second_in_flight(findings)
     if second is None:
         return None
-    return Rivals((first.evidence, second), _without(findings.world, first.evidence.name))
+    return Rivals((first.evidence, second), without_effect(findings.world, first.evidence.name))
 
 
 def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Experiment]) -> NextExperiment | None:
@@ -288,8 +288,3 @@ def _advice(rivals: Rivals, left: Sequence[str]) -> str:
         if spec in left:
             words.append(f"{spec}: {OTHERWISE.get(effect.name, effect.reveals)}")
     return "; ".join(words)
-
-
-def _without(world: World, name: str) -> World:
-    """Return the world without an effect."""
-    return replace(world, effects=tuple(a for a in world.effects if a.effect.name != name))

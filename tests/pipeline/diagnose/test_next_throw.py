@@ -197,6 +197,10 @@ def test_rivals_are_equals_or_what_comes_close_behind() -> None:
     equals = rivals_of(findings(world, first, second))
     assert equals is not None and equals.names == near.names
     assert rivals_of(replace(findings(world, first, second), verdict="unexplained")) is None
+    # without the drag nothing carries a wind
+    windy = world_with("ball", {"linear_drag": {"c": 0.3}, "wind": {"w_x": 1.0}, "magnus_lift": {"s": 0.01}})
+    beside = rivals_of(findings(windy, first, second))
+    assert beside is not None and [one.effect.name for one in beside.world.effects] == ["magnus_lift"]
 
 
 def test_the_command_says_what_to_throw_next(tmp_path: Path) -> None:
