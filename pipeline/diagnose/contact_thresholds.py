@@ -48,7 +48,10 @@ class SlidingThresholds:
         0.78, "1", "see `score_sure`; also needed where flight is not explained", "as `score_sure`", "see `score_sure`"
     )
     many_parameters: int = threshold(
-        4, "parameters", "`score_sure` does not apply to an effect with more: a friction map can fit almost anything"
+        4,
+        "parameters",
+        "`score_sure` does not apply to an effect with more, nor is it a rival of one with `few_parameters` that "
+        "explains more: a friction map can fit almost anything",
     )
     gain_t: float = threshold(
         1.0,

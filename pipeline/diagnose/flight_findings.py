@@ -81,7 +81,12 @@ class FlightFindings:
     @property
     def remains(self) -> bool:
         """Whether a residual exceeds the noise beside the selected effects."""
-        return is_significant(self.after) or self.repeats or self.own_law is not None
+        return is_significant(self.after) or self.recurs
+
+    @property
+    def recurs(self) -> bool:
+        """Whether a residual beside the selected effects repeats, or follows a law where it differs."""
+        return self.repeats or self.own_law is not None
 
     @property
     def explained_share(self) -> float:

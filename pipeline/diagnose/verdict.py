@@ -90,9 +90,9 @@ def find(
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
     note("diagnose: held-out episodes")
     errors = _errors(contact, flown)
-    # what flights show may be what contact imitates
-    limits = THRESHOLDS.segments
-    contact = _without_useless(contact, limits.confirmed if flown.remains or flown.own else -limits.worse_t)
+    # what flights show may be what contact imitates, but for what does not repeat
+    limits, imitated = THRESHOLDS.segments, flown.recurs or bool(flown.own)
+    contact = _without_useless(contact, limits.confirmed if imitated else -limits.worse_t)
     in_contact = any(one.where == "contact" for one in contact.chosen)
     misfits = () if contact.segments is None or in_contact else misfits_of(contact.segments)
     verdict = _verdict(contact.chosen, flown)
@@ -122,7 +122,10 @@ def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
 
     What is left in flight is physics or an error of the tracking, of which no model is exact. Effects that predict
     episodes that they were not fitted to have to explain what repeats from episode to episode; all others nearly all.
+    Effects of contact alone explain no flight, and stand where nothing repeats there.
     """
+    if not (flown.in_flight or flown.own or flown.doubtful or flown.recurs) and chosen:
+        return "not_separable" if any(len(one.equals) > 1 for one in chosen) else "missing_effect"
     too_little = is_significant(flown.after) and flown.explained_share < LIMITS.enough_share
     errors = flown.slow is not None or (flown.predicts and not (flown.repeats or flown.untold))
     if flown.doubtful or (too_little and not errors):

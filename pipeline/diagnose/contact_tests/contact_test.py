@@ -124,6 +124,10 @@ class ContactTest(Protocol):
         """Return the leads over the best effect's rivals; without any of them the two are equals."""
         ...
 
+    def outdone(self, best: Evidence, one: Evidence) -> bool:
+        """Return whether a rival within a lead is none, as what its numbers could do is more than it does."""
+        return False
+
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> Sequence[Bar]:
         """Return the bars of which the best effect, the first of the equals, has to pass one."""
         ...
@@ -154,7 +158,9 @@ def selected(test: ContactTest, evidence: Sequence[Evidence], data: ContactData)
         return []
     leads = test.leads(best)
     equals = [best, *(one for one in admissible[1:] if any(lead.shared(best, one) for lead in leads))]
-    return equals if any(bar.passed(best) for bar in test.bars(equals, data)) else []
+    if not any(bar.passed(best) for bar in test.bars(equals, data)):
+        return []
+    return [best, *(one for one in equals[1:] if not test.outdone(best, one))]
 
 
 def fitted_evidence(

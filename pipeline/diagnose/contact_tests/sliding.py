@@ -94,6 +94,12 @@ class SlidingTest(ContactTest):
             Lead(score=self.limits.misled, rival=Bar(share=self.limits.rival_share * best.share)),
         )
 
+    def outdone(self, best: Evidence, one: Evidence) -> bool:
+        """Return whether an effect that can fit almost anything fits less than the best one, which has few numbers."""
+        few, many = (len(e.candidate.effect.parameters) for e in (best, one))
+        fits = one.test.statistic > best.test.statistic - self.limits.lead
+        return few <= self.limits.few_parameters and many > self.limits.many_parameters and not fits
+
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bars for an effect, and for one that leaves next to nothing unexplained."""
         best = equals[0]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -125,6 +125,9 @@ def test_what_differs_from_episode_to_episode_beside_slow_errors_is_no_missing_p
     left = replace(silent, slow=errors, left=law, after=Omnibus(3.0, 100.0, 1e-9), common_share=float(not repeats))
     assert left.remains and _verdict((), left) == ("unexplained" if repeats else "none_missing")
     assert _verdict((), replace(left, slow=None, left=None)) == "unexplained"
+    # what contact shows stands beside a misfit of flights that repeats nowhere, and not beside one that does
+    seen: Any = SimpleNamespace(equals=(SimpleNamespace(name="torsional_friction"),))
+    assert _verdict((seen,), replace(left, slow=None)) == ("unexplained" if repeats else "missing_effect")
 
 
 def test_rivals_in_the_presence_of_an_effect_that_has_gone_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
