@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from ...optimization.levenberg_marquardt import robust_loss
 from .contact_result import ContactEstimate
@@ -41,6 +40,8 @@ def loss_start(residuals: ForceResiduals, estimate: ContactEstimate, scale: floa
     wide = [k for k, p in enumerate(estimate.parameters) if p.logarithmic and std[k] > OPEN]
     if not wide:
         return None
+    from scipy.optimize import nnls  # dear to import, and seldom needed
+
     none = estimate.values.copy()
     none[wide] = limits[wide, 0]
     base, alone, sizes = _rolled(residuals, none[None])[0], [], []
