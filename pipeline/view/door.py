@@ -107,8 +107,8 @@ def require_closed(host: str, port: int) -> None:
         raise UsageError(
             "this version of viser cannot be kept from showing the scene to every page that is open in a browser "
             f"(found {answer.decode(errors='replace').splitlines()[:1]}).",
-            "viser 1.0 to 1.1.",
-            "pip install 'viser>=1.0,<1.2'.",
+            "viser 1.1.",
+            "pip install 'viser>=1.1,<1.2'.",
         )
 
 

@@ -227,11 +227,14 @@ class Viewer:
         self._frame = gui.add_slider("frame", min=0, max=1, step=1, initial_value=0)
         self._status = gui.add_markdown("")
         self._play = gui.add_button("Pause" if self._playing else "Play", icon=None)
-        self._speed = gui.add_dropdown("speed", list(SPEEDS), initial_value="3 times slower")
-        places = gui.add_button_group("look from", [_OVERVIEW, *self._motion.cameras])
-        places.on_click(lambda event: self._guarded(lambda: self._look_from(event.client, places.value)))
-        seen = any(handle is not None for handle in self._splats)
-        with gui.add_folder("Show"):
+        aside = gui.add_panel()  # folded on narrow screens, which the controls would half cover
+        gui.main_panel.dock_right()
+        aside.dock_below(gui.main_panel)
+        with aside.add_tab("Show"):
+            self._speed = gui.add_dropdown("speed", list(SPEEDS), initial_value="3 times slower")
+            places = gui.add_button_group("look from", [_OVERVIEW, *self._motion.cameras])
+            places.on_click(lambda event: self._guarded(lambda: self._look_from(event.client, places.value)))
+            seen = any(handle is not None for handle in self._splats)
             self._contacts = gui.add_checkbox("contacts", True)
             self._looks = gui.add_checkbox("splats", seen, disabled=not seen and self._background is None)
             self._through = gui.add_checkbox("see-through bodies", False, disabled=not seen)
@@ -239,7 +242,7 @@ class Viewer:
             self._axes = gui.add_checkbox("body frames", False)
             self._frusta = gui.add_checkbox("cameras", True)
             self._jointed = gui.add_checkbox("joints", True, visible=bool(self._joints))
-        self._arrow_note = gui.add_html("")
+            self._arrow_note = gui.add_html("")
         self._frame.on_update(lambda _: self._guarded(lambda: self._show(self._frame.value)))
         self._choice.on_update(lambda _: self._guarded(lambda: self._begin(self._load(self._choice.value))))
         self._play.on_click(lambda _: self._toggle())

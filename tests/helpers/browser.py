@@ -65,6 +65,10 @@ class Page:
             for kind in ("keyDown", "keyUp"):
                 self._call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
 
+    def resize(self, width: int, height: int) -> None:
+        """Give the window another size [px]."""
+        self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
     def screenshot(self) -> np.ndarray:
         """Return what is seen, uint8 RGB (H, W, 3)."""
         data = base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])

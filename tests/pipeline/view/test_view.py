@@ -415,4 +415,10 @@ def test_a_model_opens_in_motion(red_dataset: Path, tmp_path: Path, served: Call
         page.run("[...document.querySelectorAll('[role=option]')].find(e => e.innerText === 'rollout 0').click()")
         page.until_it_says("frame 1 of 31")
         eventually(page, lambda found: len(found) > 100 and bool(np.linalg.norm(found.mean(0) - resting) > 20))
+        page.resize(400, 800)  # as narrow as a phone: what is shown is chosen behind one line, below the scene
+        page.until("!document.body.innerText.includes('collision spheres')")
+        label = "[...document.querySelectorAll('label')].find(e => e.innerText === 'motion')"
+        assert page.run(f"{label}.getBoundingClientRect().top") > 0.65 * 800
+        page.run("[...document.querySelectorAll('*')].filter(e => e.innerText?.trim() === 'Show').at(-1).click()")
+        page.until_it_says("collision spheres")
         assert faults(page) == []
