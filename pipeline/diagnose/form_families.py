@@ -50,6 +50,23 @@ def own_field(motion: FlownMotion, active: ActiveEffect) -> ForceField | None:
     return ForceField(axes.expand(shape).clone(), torch.zeros(shape, dtype=torch.float64))
 
 
+def laws_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) -> list[ForceField]:
+    """Return the laws of an effect and of its equals, its own the first: a drag that is not told from the other one.
+
+    Args:
+        motion: The flights.
+        own: The force.
+        named: Names of the effect and of its equals.
+    """
+    size = _in_medians(motion, "speed", motion.velocity_m_s)
+    return [own, *(own.times(size**power) for power in _known_powers(named))]
+
+
+def _known_powers(named: tuple[str, ...]) -> set[int]:
+    """Return the powers of the speed that make the drag of a name that of one of its equals."""
+    return {power for (drag, power), other in OTHER_DRAG.items() if drag in named[:1] and other in named}
+
+
 def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) -> list[Family]:
     """Return the forms of a force, in families of one coordinate.
 
@@ -119,15 +136,19 @@ def _where(motion: FlownMotion, name: str, values: Tensor) -> Mapping[str, Tenso
 
 def _how_fast(motion: FlownMotion, name: str, vectors: Tensor, named: tuple[str, ...] = ()) -> Mapping[str, Tensor]:
     """Return factors of a force by other powers of speed or spin, or on one side of it; none where it has no spread."""
-    plain = vectors.norm(dim=-1)
-    size = plain.clamp_min(LIMITS.slowest[name == "spin"])
-    size = size / motion.median(size)
+    plain, size = vectors.norm(dim=-1), _in_medians(motion, name, vectors)
     if not bool((size[motion.inside] - 1).abs().max() > 1e-6):
         return {}
-    known = {power for (drag, power), other in OTHER_DRAG.items() if drag in named[:1] and other in named}
+    known = _known_powers(named)
     found = {f"times the {name} to the power {power}": size**power for power in LIMITS.powers if power not in known}
     for edge in torch.quantile(plain[motion.inside], torch.tensor(LIMITS.edges, dtype=plain.dtype)).tolist():
         on = (plain > edge).double()
         words = f"{edge:.2g} {'m/s' if name == 'speed' else 'rad/s'} alone"
         found |= {f"where the {name} is above {words}": on, f"where the {name} is below {words}": 1 - on}
     return found
+
+
+def _in_medians(motion: FlownMotion, name: str, vectors: Tensor) -> Tensor:
+    """Return speeds or spins (B, T) in their median, the slowest taken as those of which the direction is known."""
+    size = vectors.norm(dim=-1).clamp_min(LIMITS.slowest[name == "spin"])
+    return size / motion.median(size)

@@ -9,10 +9,11 @@ the other effects fitted again, and has as many numbers; a torque that swings ha
 they do in BIC.
 
 Before the data, no form of a family is likelier than another, no family likelier than another, and all together are as
-likely as the law that is named; the odds are those of the mean likelihoods. No model of errors is exact, and how the
-numbers of a force scatter from episode to episode tells how far it can be believed (`falsification`). The law of least
-chi2 says that scatter, since a wrong one scatters by what it misses: with d degrees of freedom, which this scatter s is
-known to, a law whose chi2 is larger by x has the likelihood (1 + x / (d s))^(-d/2), that of Student's distribution.
+likely as the law that is named, or the laws where flights do not tell two drags apart; the odds are those of the mean
+likelihoods. No model of errors is exact, and how the numbers of a force scatter from episode to episode tells how far
+it can be believed (`falsification`). The law of least chi2 says that scatter, since a wrong one scatters by what it
+misses: with d degrees of freedom, which this scatter s is known to, a law whose chi2 is larger by x has the likelihood
+(1 + x / (d s))^(-d/2), that of Student's distribution.
 
 What else acts need not be named yet: the push of a wind that is too small to be named bends the law of the drag through
 which it acts, and another power of the speed follows that, too. Each law, that of the name and every other one, is
@@ -36,7 +37,7 @@ from ..segments.candidates import Candidate, acts_in, admissible, variants_of
 from ..segments.force_fields import FlownMotion
 from ..segments.segments import Segments
 from .coupled_effects import DRAGS
-from .form_families import Family, families_of, own_field
+from .form_families import Family, families_of, laws_of, own_field
 from .form_fit import FormCost, FormFit, Scales
 from .session_scales import apart, linearize_beside_scales, members, scale_spread
 from .thresholds import THRESHOLDS
@@ -101,10 +102,10 @@ def other_forms(
             continue
         other = [one for one in kept if one.effect.name not in _alike(named)]
         more = [one for one in variants_of(other, world.gravity[0, :1]) if acts_in(one, "flight")]
-        families = families_of(motion, own, named)
+        laws, families = laws_of(motion, own, named), families_of(motion, own, named)
         forms = {words: field for family in families for words, field in family.forms.items()}
-        fit = FormFit.of(motion, active[named[0]], [own, *forms.values()], more, scales)
-        found.append(_compared(fit, named[0], families, dispersion))
+        fit = FormFit.of(motion, active[named[0]], [*laws, *forms.values()], more, scales)
+        found.append(_compared(fit, named[0], len(laws), families, dispersion))
     return found
 
 
@@ -124,8 +125,16 @@ def _alike(named: Sequence[str]) -> set[str]:
     return found | set(DRAGS) if named[0] in DRAGS else found
 
 
-def _compared(fit: FormFit, name: str, families: Sequence[Family], dispersion: float) -> OtherForms:
-    """Compare an effect, whose own law is the first form, with families of others, each with one more effect or not."""
+def _compared(fit: FormFit, name: str, laws: int, families: Sequence[Family], dispersion: float) -> OtherForms:
+    """Compare an effect with families of other forms, each with one more effect or not.
+
+    Args:
+        fit: The forms, the laws of the effect and of its equals the first ones.
+        name: The effect.
+        laws: How many laws these are, none likelier than another.
+        families: The other forms.
+        dispersion: Factor by which variances exceed those of the noise.
+    """
     forms = [words for family in families for words in family.forms]
     tried = [_tried(fit, columns, dispersion) for columns in fit.forms]
     likeliest = min(
@@ -140,7 +149,8 @@ def _compared(fit: FormFit, name: str, families: Sequence[Family], dispersion: f
         )
         for groups in tried
     ]
-    half = {words: log - logs[0] for words, log in zip(forms, logs[1:], strict=True)}
+    own = _log_mean(logs[:laws])
+    half = {words: log - own for words, log in zip(forms, logs[laws:], strict=True)}
     best = max(half, key=lambda one: half[one])
     together = [_log_mean([half[words] for words in family.forms]) for family in families]
     then = next(family.then for family in families if best in family.forms)

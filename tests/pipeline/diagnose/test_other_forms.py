@@ -88,8 +88,10 @@ def _pushed(track: Track, push: Callable[[Array], Array]) -> Track:
     return replace(track, position_m=track.position_m + push(track.time_s)[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def forms_of(plain: World, episodes: list[tuple[str, dict[str, Track]]], names: list[str]) -> list[OtherForms]:
-    """Return the other forms of effects that are fitted to episodes."""
+def forms_of(
+    plain: World, episodes: list[tuple[str, dict[str, Track]]], names: list[str], equal: str = ""
+) -> list[OtherForms]:
+    """Return the other forms of effects that are fitted to episodes, the first one with an equal."""
     prepared = prepare(plain, episodes, NOISE)
     assert prepared.flight is not None
     like = plain.gravity[0, :1]
@@ -100,7 +102,8 @@ def forms_of(plain: World, episodes: list[tuple[str, dict[str, Track]]], names: 
     world = replace(plain, effects=tuple(named))
     fitted = refit([prepared.flight], world, base_parameters(world, "flight"))
     library = [Candidate(name, load_effect(name)) for name in LIBRARY]
-    return other_forms(fitted.segments[0], fitted.world, [(name,) for name in names], 1.0, library)
+    classes = [(name,) if k or not equal else (name, equal) for k, name in enumerate(names)]
+    return other_forms(fitted.segments[0], fitted.world, classes, 1.0, library)
 
 
 @pytest.mark.parametrize(
@@ -121,6 +124,14 @@ def test_a_drag_above_a_speed_is_no_drag() -> None:
     braked = replace(ball, effects=(ActiveEffect.of(DragAboveSpeed(), {"c": 0.3}, ball.gravity[0, :1]),))
     found = form_of(braked, "linear_drag")
     assert found.likelier and "where the speed is above" in found.words and "faster" in found.then
+
+
+def test_where_two_drags_are_not_told_apart_other_forms_have_to_beat_both() -> None:
+    ball = world_with("ball")
+    data = tosses(world_with("ball", {"quadratic_drag": {"k": 0.2}}), 3, 4, 0.4, 60.0, NOISE, (0.9, 1.2))
+    (alone,), (either,) = forms_of(ball, data, ["linear_drag"]), forms_of(ball, data, ["linear_drag"], "quadratic_drag")
+    assert alone.likelier and alone.words == "the same force times the speed to the power 1"
+    assert not either.likelier
 
 
 def test_a_damping_by_the_square_of_the_spin_is_no_spin_damping() -> None:
