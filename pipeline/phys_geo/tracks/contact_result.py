@@ -142,18 +142,17 @@ class FitRecord:
 
     def unconverged(self) -> list[str]:
         """Return a warning for each part of the fit whose descent ended at its limit of steps."""
+        shot = self.shooting is None or self.shooting.converged or not self.shooting.kept
         parts = {
-            "the mass distribution": _converged(self.mass_distribution),
-            "the effects": _converged(self.effects),
-            "the measured forces": _converged(self.forces),
-            "the contact parameters (multiple shooting)": self.shooting is None
-            or self.shooting.converged
-            or not self.shooting.kept,
+            "the mass distribution": (_converged(self.mass_distribution), ""),
+            "the effects": (_converged(self.effects), ""),
+            "the measured forces": (_converged(self.forces), ""),
+            "the contact parameters (multiple shooting)": (shot, ", or pass a larger --set phys-geo.iterations"),
         }
         return [
             f"the fit of {part} did not converge within its steps: its estimates may be off by more than their "
-            "intervals. Fit more or cleaner episodes, or pass a larger --set phys-geo.iterations."
-            for part, ended in parts.items()
+            f"intervals. Fit more or cleaner episodes{or_else}."
+            for part, (ended, or_else) in parts.items()
             if not ended
         ]
 

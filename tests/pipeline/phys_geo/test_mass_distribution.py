@@ -170,6 +170,7 @@ def test_a_part_that_did_not_converge_is_a_warning() -> None:
     assert record.unconverged() == []
     (text,) = replace(record, effects={"in_flight": {"costs": []}, "converged": False}).unconverged()
     assert text.startswith("the fit of the effects did not converge within its steps")
+    assert "--set" not in text  # no setting changes these steps
 
 
 def test_few_episodes_and_centroids_are_refused() -> None:
