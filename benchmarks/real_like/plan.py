@@ -28,6 +28,8 @@ Stage = Literal[
     "report10",
     "report11",
     "report12",
+    "report13",
+    "report14",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on `development` alone. Each report stage is read once, after everything is fixed: the first
