@@ -192,7 +192,8 @@ def _not_ruled_out(
 
     Where episodes belong to several sessions, each may have a scale of lengths of its own, of which flights show the
     mean beside whatever else acts: one scale for all is then as wrong in contact as none, and what it gains there is
-    true without being all. So it is not ruled out, and rules nothing else out.
+    true without being all. So it is not ruled out, and rules nothing else out. Nor does a constant force, which is a
+    tilt and another gravity together: what its further number gains in contact may be what the contact law misses.
 
     Args:
         equals: The equals.
@@ -203,7 +204,8 @@ def _not_ruled_out(
     """
     order = sorted(range(len(equals)), key=lambda k: (total[k] + _bic(equals[k], linear), equals[k].name))
     apart = {k for k in order if sessions and equals[k].name == SCALE}
-    best = min([k for k in order if k not in apart] or order, key=lambda k: total[k])
+    ruling = [k for k in order if k not in apart]
+    best = min([k for k in ruling if equals[k].name != FORCE] or ruling or order, key=lambda k: total[k])
     kept = []
     for k in order:
         if k in apart:

@@ -81,6 +81,13 @@ def test_a_scale_of_lengths_neither_rules_out_nor_is_ruled_out_where_sessions_ma
     assert [{one.name for one in some} for some in found] == [kept, alone]
 
 
+def test_a_constant_force_rules_no_tilt_out_that_is_a_part_of_it() -> None:
+    names, total = ("constant_force", "gravity_tilt", "frame_tilt"), (0.0, 60.0, 200.0)
+    gains = [np.full(8, -cost / 8) for cost in total]
+    found = _not_ruled_out([evidence(name) for name in names], gains, np.array(total), linear(np.zeros(8)), False)
+    assert {one.name for one in found} == {"constant_force", "gravity_tilt"}
+
+
 def test_effects_that_do_the_same_are_kept_beside_the_first() -> None:
     rows = np.random.default_rng(1).standard_normal((6, 20, 2))
     rows = np.concatenate((rows, 2 * rows[..., :1]), -1)  # the third does what the first does
