@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import Emit, loading
-from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, require_warmup, trust
+from .options import (
+    AcceptUnits,
+    AnyDevice,
+    Overwrite,
+    TrustEffects,
+    require_models_first,
+    require_warmup,
+    trust,
+)
 from .verb import verb
 
 if TYPE_CHECKING:
@@ -50,6 +58,7 @@ def compare(
     with loading():
         from ..pipeline.compare import compare as work
     require_warmup(warmup_s)
+    require_models_first("compare", models, capture)
     from ..pipeline.compare.page import default_page
 
     page = out or default_page(models, split)

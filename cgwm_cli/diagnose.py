@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import Emit, loading
-from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, trust
+from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, require_models_first, trust
 from .verb import verb
 
 if TYPE_CHECKING:
@@ -79,6 +79,7 @@ def diagnose(
 ) -> None:
     """Find the missing physical or measurement effect, and those that these data cannot distinguish from it."""
     trust(trust_effects)
+    require_models_first("diagnose", [model], capture)
     with loading():
         from ..pipeline.diagnose import diagnose as work
         from ..pipeline.diagnose.page import default_page

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from .execution import Emit, loading
-from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, require_warmup, trust
+from .options import (
+    AcceptUnits,
+    AnyDevice,
+    Overwrite,
+    TrustEffects,
+    require_models_first,
+    require_warmup,
+    trust,
+)
 from .verb import verb
 
 if TYPE_CHECKING:
@@ -57,6 +65,7 @@ def evaluate(
     with loading():
         from ..pipeline.evaluate import evaluate as work
     require_warmup(warmup_s)
+    require_models_first("eval", [model], target)
     emit(work(model, target, split, warmup_s, device, accept_units, reference, page, overwrite), _summary)
 
 

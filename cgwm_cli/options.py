@@ -7,9 +7,12 @@ default of the stage, and a test compares the two.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
@@ -60,6 +63,24 @@ def trust(named: str) -> None:
         from ..pipeline.physics.effects.trust import trust_effects
 
         trust_effects(names)
+
+
+def require_models_first(verb: str, models: Sequence[Path], capture: Path) -> None:
+    """Refuse a capture among the models that has been given before the capture, and say which order is meant."""
+    from ..datasets.io.kinds import kind_of
+
+    given = [*models, capture]
+    swapped = [path for path in models if kind_of(path) == "capture"]
+    if not swapped or kind_of(capture) == "capture":
+        return
+    from ..schemas import UsageError
+
+    right = " ".join(str(path) for path in (*(path for path in given if path not in swapped), swapped[0]))
+    raise UsageError(
+        f"{swapped[0]} is a capture, and {capture} is none: the capture comes last.",
+        f"cgwm {verb} MODEL{'...' if verb == 'compare' else ''} CAPTURE.",
+        f"cgwm {verb} {right}",
+    )
 
 
 def require_warmup(warmup_s: float) -> None:

@@ -41,14 +41,20 @@ def validate(
         raise typer.Exit(1)
 
 
+_SENTENCES = {"warnings": "warning", "inconsistencies": "inconsistency"}
+"""Facts that are lists of sentences, each of which has a line of its own, and the word before it."""
+
+
 def _summary(report: ValidationReport) -> str:
     from .output import table
 
     count = len(report.faults)
     verdict = f"{count} fault{'s' if count > 1 else ''}" if count else "no faults"
     faults = [f"  fault: {fault}" for fault in report.faults]
-    facts = table([[name.replace("_", " "), _text(value)] for name, value in report.facts.items()])
-    return "\n".join(part for part in [f"{report.kind} {report.path}: {verdict}.", *faults, facts] if part)
+    sentences = [name for name, value in report.facts.items() if name in _SENTENCES and value]
+    said = [f"  {_SENTENCES[name]}: {text}" for name in sentences for text in report.facts[name]]
+    facts = table([[name.replace("_", " "), _text(v)] for name, v in report.facts.items() if name not in sentences])
+    return "\n".join(part for part in [f"{report.kind} {report.path}: {verdict}.", *faults, *said, facts] if part)
 
 
 def _text(value: Any) -> str:

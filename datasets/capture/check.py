@@ -346,6 +346,8 @@ def _check_tracks(
     facts.track_samples += sum(len(track) for track in found.tracks.values())
     facts.normalised_quaternions += found.normalised
     unturned[episode] = found.unturned
+    if found.tracks and (text := capture.window_warning(episode, found.tracks)):
+        facts.warnings.append(text)
 
 
 def _check_video(capture: CaptureFolder, camera: str, episode: str, facts: CaptureFacts) -> None:

@@ -219,6 +219,28 @@ class CaptureFolder:
             require_told_spin(path, name, track)
         return CheckedTracks(windowed, normalised, tuple(unturned))
 
+    def window_warning(self, episode: str, tracks: Mapping[str, Track]) -> str:
+        """Return a warning about a `start_s` or `end_s` outside of an episode's tracks, or an empty text.
+
+        Args:
+            episode: Its name.
+            tracks: Tracks by body within the window; a limit outside of them left all their samples.
+        """
+        start_s, end_s = self._window(episode)
+        first = min(float(track.time_s[0]) for track in tracks.values())
+        last = max(float(track.time_s[-1]) for track in tracks.values())
+        sample = max(float(np.median(np.diff(track.time_s))) for track in tracks.values())
+        if end_s is not None and end_s > last + 2 * sample:
+            limit, value = "end_s", end_s
+        elif start_s is not None and start_s < first - 2 * sample:
+            limit, value = "start_s", start_s
+        else:
+            return ""
+        return (
+            f"episode '{episode}': its {limit} = {value:g} lies outside of its tracks, which last from {first:g} s to "
+            f"{last:g} s, so that it cuts nothing off; correct [episodes] '{episode}' in capture.toml."
+        )
+
     def unturned_warning(self, episodes: Mapping[str, Sequence[str]]) -> str:
         """Return a warning about tracks whose orientation never changes, or an empty text.
 

@@ -211,7 +211,13 @@ def _samples(
 
 def _header(path: Path, found: list[str], columns: Mapping[str, str], units: Units) -> _Header:
     names = [name.strip() for name in found]
-    if names and all(map(_is_number, names)):
+    if not any(names):
+        raise InputDataError(
+            f"{path}: empty, without a first line that names the columns.",
+            f"a header line with {', '.join(_REQUIRED)}, and a line for each sample.",
+            "export the recording again, or remove the file.",
+        )
+    if all(map(_is_number, names)):
         raise InputDataError(
             f"{path}: the first line holds numbers, so that nothing says what the {len(names)} columns are.",
             "a first line with the names of the columns, such as time,px,py,pz,qw,qx,qy,qz.",
@@ -248,7 +254,15 @@ def _require_columns(path: Path, names: list[str], index: Mapping[str, int]) -> 
 def _units(path: Path, names: list[str], index: Mapping[str, int], units: Units) -> Units:
     """Return the units of the options and of the column names, which must not contradict each other."""
     for kind, legal, keys in (("length", _LENGTHS, _REQUIRED[1:]), ("time", _TIMES, _REQUIRED[:1])):
-        named = {unit for key in keys if (unit := _plain(names[index[key]])[1]) in legal}
+        by_name = {names[index[key]]: unit for key in keys if (unit := _plain(names[index[key]])[1]) in legal}
+        silent = [names[index[key]] for key in keys if names[index[key]] not in by_name]
+        if by_name and silent and getattr(units, kind) is None:
+            raise InputDataError(
+                f"{path}: '{next(iter(by_name))}' names its unit, and {' and '.join(map(shown, silent))} none.",
+                f"a unit in all of {', '.join(names[index[key]] for key in keys)}, or in none.",
+                f"rename the columns, or state it for all: --{kind}-unit {next(iter(by_name.values()))}.",
+            )
+        named = set(by_name.values())
         named |= {getattr(units, kind)} - {None}
         if len(named) > 1:
             raise InputDataError(

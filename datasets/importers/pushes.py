@@ -25,7 +25,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import Body, Ground, InputDataError, World
+from ...schemas import Body, Ground, InputDataError, World, did_you_mean
 from ...schemas.documents import parse_json
 from ...schemas.imports import ImportResult
 from ..capture.files import entries_of, require_regular_file
@@ -156,11 +156,9 @@ def _chosen(files: list[Path], only: str | None) -> list[Path]:
     if not chosen:
         stems = sorted({path.stem for path in files if path.suffix.lower() in _READERS})
         raise InputDataError(
-            f"no file '{only}' among {', '.join(stems[:8]) or 'none'}."
-            if stems
-            else f"{files[0]}: no pushes by its ending.",
-            f"{', '.join(_READERS)}; --only NAME of one of them.",
-            _TODO,
+            f"--only {only}: no file of this name." if stems else f"{files[0]}: no pushes by its ending.",
+            f"{', '.join(stems[:8])}.{did_you_mean(only or '', stems)}" if stems else f"{', '.join(_READERS)}.",
+            "name one of these, or leave --only out." if stems else _TODO,
         )
     return chosen
 

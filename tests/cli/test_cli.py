@@ -191,6 +191,14 @@ def test_dashes_alone_make_no_option_like_another(run: Run) -> None:
     assert "Did you mean" not in run("compare", "model", "capture", "--page")[2]
 
 
+def test_a_capture_before_the_models_is_told(run: Run, tmp_path: Path) -> None:
+    for name, mark in (("c", "capture.toml"), ("m", "model.json")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / mark).touch()
+    code, _, said = run("compare", str(tmp_path / "c"), str(tmp_path / "m"))
+    assert code == 2 and said.splitlines()[-1] == f"Next: cgwm compare {tmp_path / 'm'} {tmp_path / 'c'}"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

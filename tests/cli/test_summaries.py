@@ -110,6 +110,17 @@ def test_validate() -> None:
     ]
 
 
+def test_validate_gives_each_warning_a_line() -> None:
+    facts = {"photos": 2, "warnings": ["One.", "Two."], "inconsistencies": []}
+    assert validate._summary(ValidationReport(path="c", kind="capture", facts=facts)).splitlines() == [
+        "capture c: no faults.",
+        "  warning: One.",
+        "  warning: Two.",
+        "  photos           2",
+        "  inconsistencies  none",
+    ]
+
+
 def test_doctor() -> None:
     report = DoctorReport(
         cgwm="0.1.0",

@@ -502,6 +502,12 @@ def test_fault_in_a_track(root: Path) -> None:
     assert fault(root).splitlines()[0] == "C/tracks/000.csv, line 1: unknown column 'px_mm'."
 
 
+def test_a_window_that_cuts_nothing_off_is_a_warning(root: Path) -> None:
+    replace_text(root / "capture.toml", "end_s = 0.1", "end_s = 9.0")
+    (said,) = check_capture(Capture.open(root)).warnings
+    assert said.startswith("episode '001': its end_s = 9 lies outside of its tracks, which last from 0 s to")
+
+
 def test_episode_of_one_sample_and_of_one_frame(root: Path) -> None:
     replace_text(root / "capture.toml", "end_s = 0.1", "end_s = 0.04")
     message = fault(root)

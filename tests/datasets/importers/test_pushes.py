@@ -102,5 +102,5 @@ def test_one_file_of_a_folder(tmp_path: Path) -> None:
         import_pushes(tmp_path / "empty.tar", tmp_path / "none")
     groups = {entry.group for entry in Capture.open(tmp_path / "nested", check=False).manifest.episodes.values()}
     assert groups == {"in_a"}
-    with pytest.raises(InputDataError, match=r"no file 'c' among a, b\."):
+    with pytest.raises(InputDataError, match=r"--only c: no file of this name\.\nAllowed: a, b\."):
         import_pushes(folder, tmp_path / "none", only="c")

@@ -226,7 +226,7 @@ def test_csv_faults(tmp_path: Path) -> None:
         return fault(tmp_path, import_csv, path, **change)
 
     assert fault(tmp_path, import_csv, tmp_path / "absent").startswith("T/absent: no such file or directory.")
-    assert said("").startswith("T/a.csv: no column for 'time' among none.")
+    assert said("").startswith("T/a.csv: empty, without a first line that names the columns.")
     assert said("t,x,y\n0,1,2\n").startswith("T/a.csv: no column for 'pz' among t, x, y.")
     assert said("0,1,2,3\n0.1,1,2,3\n").startswith(
         "T/a.csv: the first line holds numbers, so that nothing says what the 4"
@@ -239,6 +239,7 @@ def test_csv_faults(tmp_path: Path) -> None:
     assert said("t,x,y,z\n0,1,2,3\n").startswith("T/a.csv: body: 1 samples with a pose.")
     assert said("t,time,x,y,z\n0,0,1,2,3\n").startswith("T/a.csv: 't' and 'time' may both be 'time'.")
     assert said("t,x_mm,y_cm,z_mm\n").startswith("T/a.csv: units of length that differ: cm, mm.")
+    assert said("t,x_mm,y,z\n").startswith("T/a.csv: 'x_mm' names its unit, and 'y' and 'z' none.")
     assert "no column 'X'" in said("t,x,y,z\n", columns={"px": "X"})
     assert "'p' is nothing that a column can be" in said("t,x,y,z\n", columns={"p": "x"})
     assert "time 0 comes after 0.1" in said("t,x,y,z\n0.1,1,2,3\n0,1,2,3\n")
