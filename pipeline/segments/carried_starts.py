@@ -11,7 +11,7 @@ capture, is fitted with it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -43,6 +43,16 @@ class Beginning:
     """Whether it begins in flight."""
     up: Array
     """Unit vector (3,) against gravity."""
+
+    def without_a_row(self, step: Step) -> Iterator[Beginning]:
+        """Yield it without its last frame, its last two, and the frame that a step explains least.
+
+        What holds a body shows in many frames; one wrong row, which no step is needed to explain, does not.
+        """
+        count, worst = len(self.frames), int((step.residual_m**2).sum(1).argmax())
+        for left_out in ([count - 1], [count - 2, count - 1], [worst]):
+            kept = np.delete(np.arange(count), left_out)
+            yield replace(self, frames=self.frames[kept], times_s=self.times_s[kept], places_m=self.places_m[kept])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,8 +87,12 @@ def carried_starts(world: World, whole: Observations, noise: Noise) -> dict[int,
     width, steps = min(tried.items(), key=lambda item: _left(item[1]))
     spread = _spread(steps)
     found = {}
+
+    def large(step: Step) -> bool:
+        return step.size_m_s2 >= max(least, LIMITS.sigmas * spread * step.known_m_s2)
+
     for one, step in zip(begun, steps, strict=True):
-        if step.size_m_s2 >= max(least, LIMITS.sigmas * spread * step.known_m_s2):
+        if large(step) and all(large(_step(some, width)) for some in one.without_a_row(step)):
             # the error of the release's time is about one frame
             free = int(np.searchsorted(one.times_s, step.release_s + LIMITS.rounded * width)) + 1
             if free < len(one.frames):

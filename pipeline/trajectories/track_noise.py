@@ -64,6 +64,8 @@ def estimate_noise(tracks: Iterable[Track], flying: bool = False) -> Noise:
         if flying and track.quat_wxyz is None:
             window = max(LONG_FRAMES, round(LONG_S / float(np.median(np.diff(track.time_s)))))
             window, degree = min(window, len(track.time_s)), 3
+            if window < degree + 2:  # its cubic leaves nothing
+                continue
         first = np.arange(0, len(track.time_s) - window + 1, max(window // 2, 1))
         if not len(first):
             continue

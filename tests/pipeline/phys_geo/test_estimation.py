@@ -179,6 +179,8 @@ def test_errors_that_last_for_many_frames_count_as_noise_of_a_flying_centroid() 
     tracks = [Track(time, position)]
     assert estimate_noise(tracks)[0] < 1e-4  # short windows follow them
     assert 2e-4 < estimate_noise(tracks, flying=True)[0] < 5e-4
+    short = Track(time[:4], position[:4])  # its cubic leaves nothing
+    assert estimate_noise([*tracks, short], flying=True) == estimate_noise(tracks, flying=True)
 
 
 def test_many_tosses_give_the_ground_height_too() -> None:

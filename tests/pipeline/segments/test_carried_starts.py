@@ -71,3 +71,13 @@ def test_the_step_of_a_release_is_found_through_the_filter_that_rounds_it(width_
     found = _step(begun, width_s)
     assert (found.release_s, found.size_m_s2) == (pytest.approx(release), pytest.approx(size, rel=1e-3))
     assert np.abs(found.residual_m).max() < 1e-5
+
+
+@pytest.mark.parametrize("row", [-1, -2, 20])
+def test_one_wrong_row_is_no_hand(row: int) -> None:
+    world, episodes = world_with("ball"), thrown()
+    track = episodes[2][1]["ball"]
+    position = track.position_m.copy()
+    position[row, 2] -= 0.07  # a number that was cut off
+    wrong = [*episodes[:2], ("cut", {"ball": replace(track, position_m=position)}), *episodes[3:]]
+    assert carried_starts(world, whole_episodes(world, wrong), NOISE) == {}
