@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from .base import FileModel, read_toml
 from .capture import Name
 from .errors import did_you_mean
+from .field_texts import field_texts
 from .quantities import Coordinate, Duration, Friction, Length, Mass, Step
 from .toml_text import toml_value
 
@@ -38,9 +39,7 @@ Samples = Annotated[int, Field(ge=4, le=1_000_000)]
 
 
 class TaskSection(FileModel):
-    """A part of a task."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)  # `task_toml` writes them as comments
+    """A part of a task; `task_toml` writes the texts of its fields as comments."""
 
 
 class RobotSection(TaskSection):
@@ -253,18 +252,19 @@ def read_task(path: Path) -> ControlTask:
 
 def task_toml(task: TaskSection) -> str:
     """Return a task as TOML to edit: fields are explained, unset ones commented out."""
-    fields = type(task).model_fields
-    lines = [f"# {_told(type(task).__doc__ or '')}"]
-    for name, field in fields.items():
+    kind = type(task)
+    lines, texts = [f"# {_told(kind.__doc__ or '')}"], field_texts(kind)
+    for name in kind.model_fields:
         value = getattr(task, name)
         if not isinstance(value, TaskSection):
-            lines += _entry(name, value, field.description or "The version of this format.")
-    for name in fields:
+            lines += _entry(name, value, texts.get(name, "The version of this format."))
+    for name in kind.model_fields:
         section = getattr(task, name)
         if isinstance(section, TaskSection):
             lines += ["", f"# {_told(type(section).__doc__ or '')}", f"[{name}]"]
-            for key, field in type(section).model_fields.items():
-                lines += _entry(key, getattr(section, key), field.description or "")
+            texts = field_texts(type(section))
+            for key in type(section).model_fields:
+                lines += _entry(key, getattr(section, key), texts.get(key, ""))
     return "\n".join(lines) + "\n"
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, PrivateAttr, model_serializer, model_validator
+from pydantic import Field, PrivateAttr, model_serializer, model_validator
 
 from .base import FileModel, read_toml
+from .field_texts import field_texts
 from .toml_text import toml_key, toml_value
 
 CUT_OFF = 3.0
@@ -92,8 +93,6 @@ class Distribution(FileModel):
 class RejectionRules(FileModel):
     """Rollouts that are drawn again. A rule that is left out rejects nothing."""
 
-    model_config = ConfigDict(use_attribute_docstrings=True)  # `plan_toml` writes them as comments
-
     off_table_m: Annotated[float, Field(gt=0, le=1e8)] | None = None
     """A free body's middle gets farther than this from where the photos show it, measured along the ground [m]."""
     no_contact: bool = False
@@ -110,8 +109,6 @@ class RejectionRules(FileModel):
 
 class SamplingPlan(FileModel):
     """Distributions that rollouts are drawn from; what is left out follows from the bodies."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)  # `plan_toml` writes them as comments
 
     start: Literal["auto", "throw", "rest", "slide"] = "auto"
     """How free bodies begin: thrown through the air, resting as in the photos, or sliding on the ground. auto: at rest
@@ -250,17 +247,18 @@ def read_plan(path: Path) -> SamplingPlan:
 def plan_toml(plan: SamplingPlan, comments: bool = True) -> str:
     """Return a plan as TOML. With comments it is a template to edit: fields are explained, unset ones commented out."""
     lines = [f"# {_DOCUMENT}"] if comments else []
-    for name, field in SamplingPlan.model_fields.items():
+    texts = field_texts(SamplingPlan) if comments else {}
+    rules = field_texts(RejectionRules) if comments else {}
+    for name in SamplingPlan.model_fields:
         if name not in ("reject", "parameters"):
-            lines += _entry(name, getattr(plan, name), field.description if comments else None)
-    for table, entries in (
-        ("reject", {name: getattr(plan.reject, name) for name in RejectionRules.model_fields}),
-        ("parameters", plan.parameters),
+            lines += _entry(name, getattr(plan, name), texts.get(name))
+    for table, entries, told in (
+        ("reject", {name: getattr(plan.reject, name) for name in RejectionRules.model_fields}, rules),
+        ("parameters", plan.parameters, {}),
     ):
-        told = RejectionRules.model_fields if comments and table == "reject" else {}
-        lines += ["", *([f"# {SamplingPlan.model_fields[table].description}"] if comments else []), f"[{table}]"]
+        lines += ["", *([f"# {texts[table]}"] if comments else []), f"[{table}]"]
         for name, value in entries.items():
-            lines += _entry(toml_key(name), value, told[name].description if name in told else None)
+            lines += _entry(toml_key(name), value, told.get(name))
     return "\n".join(lines).strip() + "\n"
 
 

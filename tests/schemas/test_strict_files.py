@@ -31,6 +31,7 @@ from cgwm.schemas import (
 from cgwm.schemas.base import _in_document
 from cgwm.schemas.diagnose import ThrowsFile
 from cgwm.schemas.documents import MAX_DEPTH, parse_json, parse_toml
+from cgwm.schemas.field_texts import field_texts
 from cgwm.schemas.plan import RejectionRules
 
 CAPTURE = """format = "cgwm-capture/1"
@@ -362,8 +363,9 @@ def test_a_wrong_value_is_shown_unless_it_is_a_table(tmp_path: Path, value: str,
 
 def test_a_plan_to_edit_explains_each_rule_and_a_short_one_nothing() -> None:
     text, short = plan_toml(SamplingPlan()), plan_toml(SamplingPlan(), comments=False)
-    for name, field in RejectionRules.model_fields.items():
-        assert f"# {' '.join(str(field.description).split())}" in text and name in text
+    assert set(field_texts(RejectionRules)) == set(RejectionRules.model_fields)
+    for name, told in field_texts(RejectionRules).items():
+        assert f"# {' '.join(told.split())}" in text and name in text
     assert "#" not in short and tomllib.loads(short) is not None
 
 
