@@ -193,8 +193,7 @@ class ClosedLoop:
         outcome = self._graph.replayed() if self._graph is not None else self._advanced(None)
         pairs, finite = outcome.checks.tolist()  # waits for the device
         self._steps += 1
-        ends = {name: (drive.position_m[:, -1], drive.quat_wxyz[:, -1]) for name, drive in drives.items()}
-        self._poses = {name: (position, quat_normalize(quat)) for name, (position, quat) in ends.items()}
+        self._poses = {name: (drive.position_m[:, -1], drive.quat_wxyz[:, -1]) for name, drive in drives.items()}
         if not finite:
             raise NotConvergedError(
                 f"control step {self._steps}: the state is not finite any more.",
@@ -228,12 +227,20 @@ class ClosedLoop:
                     todo="give Velocity or Reach for it.",
                 )
             velocity, omega = self._velocities(name, wanted, position, quat)
-            drives[name] = Drive.from_velocities(self._times, position, quat, velocity[:, None], omega[:, None])
+            if bool(omega.any()):
+                drive = Drive.from_velocities(
+                    self._times, position, quat_normalize(quat), velocity[:, None], omega[:, None]
+                )
+            else:
+                drive = Drive.straight(self._times, position, quat, velocity)
+            drives[name] = drive
         return drives
 
     def _typed(self, drives: Mapping[str, Drive]) -> dict[str, Drive]:
         """Return the motions in the data type of the physics."""
         dtype = self._world.gravity.dtype
+        if dtype == torch.float64:
+            return dict(drives)
 
         def typed(value: Tensor) -> Tensor:
             return value.to(dtype) if value.is_floating_point() else value

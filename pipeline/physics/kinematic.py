@@ -93,6 +93,27 @@ class Drive:
             last=last,
         )
 
+    @staticmethod
+    def straight(times_s: Tensor, position_m: Tensor, quat_wxyz: Tensor, velocity_m_s: Tensor) -> Drive:
+        """Return a motion at a constant velocity between two samples, without a turn, in few operations.
+
+        Args:
+            times_s: The samples [s], shape (B, 2).
+            position_m: Position at the first sample [m], shape (B, 3).
+            quat_wxyz: Orientation, shape (B, 4).
+            velocity_m_s: Velocity of the frame's origin [m/s], shape (B, 3).
+        """
+        end = torch.addcmul(position_m, velocity_m_s, times_s[:, 1:] - times_s[:, :1])
+        still = torch.zeros_like(position_m)
+        return Drive(
+            times_s=times_s,
+            position_m=torch.stack((position_m, end), 1),
+            quat_wxyz=torch.stack((quat_wxyz, quat_wxyz), 1),
+            velocity_m_s=torch.stack((velocity_m_s, still), 1),
+            omega_world_rad_s=torch.stack((still, still), 1),
+            last=torch.zeros(len(times_s), dtype=torch.long, device=times_s.device),
+        )
+
     def repeat(self, times: int) -> Drive:
         """Return the commands with their batch repeated, as `Tensor.repeat` does."""
         if self.times_s.shape[0] == 1:

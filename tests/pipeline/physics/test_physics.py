@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
-from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply, quat_to_matrix
+from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_to_matrix
 from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import State, simulate
 from cgwm.pipeline.physics.engine import rollout as roll_out
@@ -62,6 +62,20 @@ def test_a_driven_body_pushes_a_free_one_and_follows_its_command() -> None:
     torch.testing.assert_close(rollout.position_m[0, :, 1, 0], -0.08 + 0.1 * rollout.times_s, atol=1e-12, rtol=0)
     # the tip's surface ends at -0.008 and the box is 0.04 long on that side; the spheres of a face leave dents in it
     assert float(rollout.position_m[0, -1, 0, 0]) == pytest.approx(0.032, abs=0.004)
+
+
+def test_a_straight_drive_is_one_from_velocities_that_do_not_turn() -> None:
+    generator = torch.Generator().manual_seed(0)
+    place, velocity = (torch.randn(3, 3, generator=generator, dtype=F64) for _ in range(2))
+    quat = quat_normalize(torch.randn(3, 4, generator=generator, dtype=F64))
+    times = torch.tensor([[0.0, 0.03], [0.1, 0.2], [0.0, 1.0]], dtype=F64)
+    still = torch.zeros(3, 1, 3, dtype=F64)
+    wanted = Drive.from_velocities(times, place, quat, velocity[:, None], still)
+    for one, other in zip(
+        vars(Drive.straight(times, place, quat, velocity)).values(), vars(wanted).values(), strict=True
+    ):
+        assert one.dtype == other.dtype
+        torch.testing.assert_close(one, other, rtol=1e-15, atol=1e-15)
 
 
 def test_a_velocity_command_is_integrated_and_is_what_the_body_does() -> None:
