@@ -22,6 +22,8 @@ _BETWEEN = 12.0
 """How near another face those points of a face lie that tell whether the edge between them is convex, in pitches."""
 _MARGIN = 2.0
 """How much deeper than the largest move the solid is built anew, in pitches."""
+_ALONG_EDGE = 0.5
+"""Cosine between a normal and an edge below which a point may lie on the edge; the end of an edge has 1."""
 _ON_PLANE = 1e-6
 _ON_SURFACE = 0.02
 """Largest distances from a plane, and of an edge from the surface, in pitches."""
@@ -159,32 +161,60 @@ class _Bounds:
         return points[np.abs(self.height(points)) < _ON_SURFACE * pitch] if len(points) else points
 
     def kept_tips(self) -> Array:
-        """Return the tips of the old surface where it is not flat, shape (k, 3)."""
+        """Return the tips of the old surface where it is not all flat, lowered onto the planes beside, shape (k, 3)."""
         tips = self.solid.corners
-        return tips[self._flat_share(self._distances(tips)) == 0] if len(tips) else tips
+        if not len(tips):
+            return tips
+        away = self._distances(tips)
+        share = self._flat_share(away)
+        rest = share < 1
+        tips, local = tips[rest], self._local(away[rest]) & (share[rest] > 0)[:, None]
+        local &= ~(local[:, None] & self._concave & ~np.eye(len(self.planes), dtype=bool)).any(2)
+        for k, plane in enumerate(self.planes):
+            above = np.maximum(tips @ plane[:3] - plane[3], 0.0) * local[:, k]
+            tips = tips - above[:, None] * plane[:3]
+        return tips
 
 
 def _with_rims(solid: Volume, face: NDArray[np.intp], planes: Array) -> NDArray[np.intp]:
     """Return the faces (S,) of the points of a surface, each grown by its rim: of several, the nearest plane counts.
 
-    What lies between two faces is their edge, however much a hull rounds it off.
+    What lies between two faces is their edge, however much a hull rounds it off, unless it faces along the edge: that
+    is where the edge ends, at a surface that is not flat.
     """
     bare, grown = np.flatnonzero(face < 0), face.copy()
-    least, beside, between = np.full(len(bare), np.inf), np.zeros(len(bare), int), np.zeros(len(bare), int)
+    least, beside = np.full(len(bare), np.inf), np.zeros(len(bare), int)
+    rims = np.zeros((len(bare), len(planes)), bool)
     for k, plane in enumerate(planes):
         points = solid.surface[face == k]
         if not len(points) or not len(bare):
             continue
         away, nearest = (np.asarray(found) for found in KDTree(points).query(solid.surface[bare]))
         height = _off_plane(solid.surface[bare], plane)
-        rim = away < _RIM * solid.pitch
-        between += rim
-        lower = rim & (height < least)
+        rims[:, k] = away < _RIM * solid.pitch
+        lower = rims[:, k] & (height < least)
         # the rim moves as far as what lies beside it, but for what hulls round off
         beside[lower] = height[lower] < _off_plane(points[nearest[lower]], plane) + solid.pitch
         grown[bare[lower]], least[lower] = k, height[lower]
-    grown[bare[(beside == 0) & (between < 2)]] = -1
+    grown[bare[(beside == 0) & ~_between(rims, solid.normals[bare], planes[:, :3])]] = -1
     return grown
+
+
+def _between(rims: NDArray[np.bool_], normals: Array, faces: Array) -> NDArray[np.bool_]:
+    """Return which points (n,) lie in the edge or corner between faces.
+
+    Args:
+        rims: Whether each point lies in the rim of each face, shape (n, F).
+        normals: Unit normals of the points, shape (n, 3).
+        faces: Unit normals of the faces, shape (F, 3).
+    """
+    found = rims.sum(1) > 2
+    for a, b in combinations(range(len(faces)), 2):
+        along = np.cross(faces[a], faces[b])
+        length = float(np.linalg.norm(along))
+        both = rims[:, a] & rims[:, b]
+        found |= both & (np.abs(normals @ along) < _ALONG_EDGE * length)
+    return found
 
 
 def _off_plane(points: Array, planes: Array) -> Array:

@@ -169,3 +169,15 @@ def test_the_best_plane_is_found_between_the_displacements_that_were_compared():
     scores = np.exp(-0.5 * ((offsets - (columns @ true)[:, None]) / 3e-4) ** 2)
     found = facets.Curves(offsets, scores, np.ones(50)).fitted(columns)
     np.testing.assert_allclose(found, true, atol=1e-5)
+
+
+def test_an_edge_ends_at_a_face_that_is_not_flat():
+    # Beyond a bulging end, no surface is near but that of the two planes: the edge would grow into a horn.
+    pillow = solid_of(pillow_height, 2 * PITCH)
+    height = pillow.surface @ AXES.T - np.tile(HALF, 2)
+    face = np.array([0, -1, 1, 2, -1, 3])[height.argmax(1)]
+    planes = np.c_[AXES, np.tile(HALF, 2)][[0, 2, 3, 5]]
+    spheres = distil(flattened(pillow, face, planes), 60)
+    over = (spheres.centers @ AXES.T + spheres.radii[:, None]).max(0) - np.tile(HALF, 2)
+    assert over[[1, 4]].max() < height.max() + 0.5 * pillow.pitch
+    assert over[[0, 2, 3, 5]].max() < 0.25 * pillow.pitch
