@@ -3,16 +3,22 @@
     pip install --no-deps -r benchmarks/requirements.txt
     python benchmarks/toss_friction.py run --workers 2
     python benchmarks/toss_friction.py table
+    python benchmarks/toss_friction.py account --seed 110
 
 Nothing is filmed: as in `engine_floor.py`, our law predicts each motion of Fall open loop from its true state with the
 true shape, mass and contact numbers, with the stated friction times each of `FACTORS`. The motion to learn from (15
 frames) says what a fit without any error of measurement would find; the ten others, what would predict them best.
 Captures of development: objects of boxes on three grounds, seeds 102 and 103.
+
+`account` says how friction acts in the motion to learn from: the horizontal over the vertical impulse, in units of the
+stated friction, while the ground carries more than `IMPACT` times the weight, and while it carries less and the body
+moves along it; and how long the latter lasts.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
 import sys
 from collections.abc import Sequence
@@ -21,6 +27,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cgwm.datasets.synthetic.dynamics import GRAVITY, STEPS_PER_S, matrix_from_quat
+from cgwm.datasets.synthetic.plan import ScenePlan
+from cgwm.schemas import NotConvergedError
 from engine_floor import UNIT_DEG, UNIT_MM
 from numpy.typing import NDArray
 from store import Keyed, Store
@@ -35,6 +44,9 @@ OBJECTS = ("box", "l_block")
 SEEDS = (102, 103)
 TESTS = 10
 _STATED = FACTORS.index(1.0)
+IMPACT, CARRIED, MOVING_M_S, _BIN_S = 2.5, 0.3, 0.03, 0.005
+"""Vertical force in units of the weight above which contact counts as an impact, and below which as none; least speed
+of a slide; and over how long forces are averaged."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +104,66 @@ def _line(engine: str, found: Sequence[NDArray[np.float64]]) -> str:
     return "| " + " | ".join([*cells, f"{best[0]:.1f} / {best[1]:.1f}", f"{stated[0]:.1f} / {stated[1]:.1f}"]) + " |"
 
 
+@dataclass(frozen=True)
+class Account:
+    """How friction acts in a motion: impulse ratios in units of the stated friction, None where nothing acts [1]."""
+
+    impact: float | None
+    slide: float | None
+    share: float
+    """Share of impacts in the horizontal impulse."""
+    slide_s: float
+    """Duration of the slides [s]."""
+
+    @staticmethod
+    def of(plan: ScenePlan) -> Account:
+        """Take the account of the motion to learn from, from the momentum of its centre of mass."""
+        motion = plan.episodes[0].motion
+        first = motion.row(0.0)
+        com = np.array([row[:3] + matrix_from_quat(row[3:7]) @ plan.solid.com for row in motion.qpos[first:]])
+        velocity = (np.gradient(com, axis=0) * STEPS_PER_S)[:: round(_BIN_S * STEPS_PER_S)]
+        change = np.diff(velocity, axis=0)
+        up, along = change[:, 2] + GRAVITY * _BIN_S, np.hypot(change[:, 0], change[:, 1])
+        load = up / (GRAVITY * _BIN_S)
+        impact = load > IMPACT
+        slide = (load > CARRIED) & ~impact & (np.hypot(velocity[1:, 0], velocity[1:, 1]) > MOVING_M_S)
+        in_impacts, in_slides = (
+            float(along[kind].sum() / up[kind].sum() / plan.contact.friction) if kind.any() else None
+            for kind in (impact, slide)
+        )
+        both = float(along[impact | slide].sum())
+        share = float(along[impact].sum()) / both if both else 0.0
+        return Account(in_impacts, in_slides, share, float(slide.sum()) * _BIN_S)
+
+
+def account(seed: int) -> str:
+    """Return by engine how friction acts in the tosses to learn from, in Markdown: medians (least to largest)."""
+    lines = [
+        "| engine | captures | impacts | slides | share of impacts % | slides last s |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for engine in ENGINES:
+        found = []
+        for name, material in itertools.product(OBJECTS, MATERIALS):
+            item = load_item(name)
+            if refusal(engine, item.solid) is None:
+                with contextlib.suppress(NotConvergedError):
+                    found.append(Account.of(plan_capture(item, name, material, "fall", seed, 0, engine)[0]))
+        if found:
+            cells = [_range([one.impact for one in found]), _range([one.slide for one in found])]
+            cells += [_range([100 * one.share for one in found], "{:.0f}"), _range([one.slide_s for one in found])]
+            lines.append(f"| {engine} | {len(found)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _range(values: Sequence[float | None], form: str = "{:.2f}") -> str:
+    known = [value for value in values if value is not None]
+    if not known:
+        return "–"
+    middle, low, high = (form.format(value) for value in (np.median(known), min(known), max(known)))
+    return f"{middle} ({low} to {high})"
+
+
 def _quartiles(values: Any) -> str:
     low, middle, high = np.percentile(values, (25, 50, 75))
     return f"{middle:.2f} ({low:.2f} to {high:.2f})"
@@ -100,7 +172,8 @@ def _quartiles(values: Any) -> str:
 def main() -> int:
     """Measure what is missing, or print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "table"))
+    parser.add_argument("what", choices=("run", "table", "account"))
+    parser.add_argument("--seed", type=int, default=110, help="of the captures of the account, below 500")
     parser.add_argument("--engines", default=",".join(ENGINES))
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
     parser.add_argument("--store", type=Path, default=None, help="file of the results, JSON lines")
@@ -109,6 +182,9 @@ def main() -> int:
     unknown = [name for name in given.engines.split(",") if name not in ENGINES]
     if unknown:
         parser.error(f"--engines: {unknown[0]!r} is none of {', '.join(ENGINES)}")
+    if given.what == "account":
+        print(account(given.seed))
+        return 0
     store = Store("toss_friction", given.store, given.any_commit)
     if given.what == "table":
         print(table(store.results()))
