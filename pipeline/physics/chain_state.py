@@ -224,6 +224,7 @@ def with_joints(
     state: State,
     values: Mapping[str, float | Tensor],
     speeds: Mapping[str, float | Tensor] | None = None,
+    placed: bool = True,
 ) -> State:
     """Return a state in which the links of all chains are where the joints put them.
 
@@ -232,6 +233,8 @@ def with_joints(
         state: Poses and velocities of the other bodies and of the roots, shapes (B, nb, ...).
         values: Values by joint name [rad or m], numbers or shape (B,); 0 for joints that are left out.
         speeds: Speeds by joint name [rad/s or m/s]; 0 for joints that are left out.
+        placed: Whether poses and velocities of links are wanted. Else only rollouts take the state: they begin with the
+            joints, from which they place the links themselves.
 
     Raises:
         UsageError: If a name is not that of a joint that moves.
@@ -243,12 +246,17 @@ def with_joints(
             f"there is no moving joint '{unknown[0]}'.", ", ".join(known) + ".", todo="name one of these joints."
         )
     for chain in world.chains:
-        state = _posed(world, state, chain, values, speeds or {})
+        state = _posed(world, state, chain, values, speeds or {}, placed)
     return state
 
 
 def _posed(
-    world: World, state: State, chain: Chain, values: Mapping[str, float | Tensor], speeds: Mapping[str, float | Tensor]
+    world: World,
+    state: State,
+    chain: Chain,
+    values: Mapping[str, float | Tensor],
+    speeds: Mapping[str, float | Tensor],
+    placed: bool = True,
 ) -> State:
     names = world.body_names
     rows = [names.index(name) for name in chain.links]
@@ -262,6 +270,11 @@ def _posed(
         batch = max([like.shape[0], *(len(part) for part in parts)])
         columns.append(torch.stack([part.expand(batch) for part in parts], -1) if parts else like.new_zeros(batch, 0))
     value, speed = columns
+    found = type(state)(*(x.expand(value.shape[0], -1, -1).clone() for x in state.tensors))
+    known = chain.moving and _versioned(found) and _principal(chain, value)
+    if known and not placed:
+        _MADE[found.position_m] = _Made(chain.identity, _versions(found), value, speed)
+        return found
     root = rows[0]
     position, quat = chain.poses(state.position_m[:, root], state.quat_wxyz[:, root], value)
     first = (state.velocity_m_s[:, root], quat_rotate(state.quat_wxyz[:, root], state.omega_body_rad_s[:, root]))
@@ -270,7 +283,7 @@ def _posed(
     for field, values_ in zip(fields, (position, quat, linear, quat_rotate(quat_conjugate(quat), omega)), strict=True):
         field[:, rows] = values_
     found = type(state)(*fields)
-    if chain.moving and _versioned(found) and _principal(chain, value):
+    if known:
         _MADE[found.position_m] = _Made(chain.identity, _versions(found), value, speed)
     return found
 

@@ -102,20 +102,48 @@ def compiled(source: str, name: str, device: int) -> Any:
     return program.get_kernel(name)
 
 
+@cache
+def most_shared_bytes(device: int) -> int:
+    """Return the shared memory that a block of threads of a device may have if a kernel asks for it [bytes]."""
+    return int(_core().Device(device).properties.max_shared_memory_per_block_optin)
+
+
+def allow_shared_bytes(kernel: Any, size: int, device: int) -> None:
+    """Let a kernel have blocks with more shared memory than any device gives without being asked.
+
+    Raises:
+        RuntimeError: If the driver refuses.
+    """
+    driver = importlib.import_module("cuda.bindings.driver")
+    attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+    (error,) = driver.cuKernelSetAttribute(attribute, size, kernel.handle, driver.CUdevice(device))
+    if int(error) != 0:
+        raise RuntimeError(f"the driver gives no block {size} bytes of shared memory: {error.name}")
+
+
 def launch(
-    kernel: Any, device: torch.device, blocks: int, threads: int, tensors: tuple[Tensor | None, ...], *words: Any
+    kernel: Any,
+    device: torch.device,
+    blocks: int,
+    threads: int,
+    tensors: tuple[Tensor | None, ...],
+    *words: Any,
+    shared_bytes: int = 0,
 ) -> None:
-    """Launch a kernel on torch's current stream; pointers come first, null where a tensor is None."""
+    """Launch a kernel on torch's current stream; pointers come first, null where a tensor is None.
+
+    `shared_bytes` is the shared memory of a block beside that which the kernel declares.
+    """
     import torch
 
     pointers = [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
     stream = _stream(torch.cuda.current_stream(device).cuda_stream)
-    _core().launch(stream, _config(blocks, threads), kernel, *pointers, *words)
+    _core().launch(stream, _config(blocks, threads, shared_bytes), kernel, *pointers, *words)
 
 
 @cache
-def _config(blocks: int, threads: int) -> Any:
-    return _core().LaunchConfig(grid=blocks, block=threads)
+def _config(blocks: int, threads: int, shared_bytes: int) -> Any:
+    return _core().LaunchConfig(grid=blocks, block=threads, shmem_size=shared_bytes)
 
 
 @cache

@@ -1,7 +1,8 @@
 """The fused kernel's source built with g++ and run on the CPU: every line of it is tested without a GPU.
 
-The threads of a warp are fibres that take turns: each runs to its next exchange with the others. As on a GPU, several
-environments share a warp, and all of its threads must take part in each exchange, at the same place of the program.
+The threads of a block are fibres that take turns: each runs to its next exchange with the others. As on a GPU, several
+environments share a warp, and all of its threads must take part in each exchange, at the same place of the program; or
+the warps of a block share an environment, and all threads must come to the places where they wait for each other.
 Environments begin in memory that is filled with what no number or index is, and a place outside of the arrays is told.
 """
 
@@ -35,15 +36,16 @@ SHIM = r"""
 #define __device__
 #define __restrict__ __restrict
 
-struct Fibres {  // the threads of a warp
-    ucontext_t home, contexts[32];
-    jmp_buf places_left[32];
-    bool begun[32];
-    double slots[2][32];
-    const void* places[2][32];
-    long exchanges[32], waits[32];
-    const void* waits_at[32];
-    bool done[32];
+const int MOST = 256;
+struct Fibres {  // the threads of a block
+    ucontext_t home, contexts[MOST];
+    jmp_buf places_left[MOST];
+    bool begun[MOST];
+    double slots[2][MOST];
+    const void* places[2][MOST];
+    long exchanges[MOST], waits[MOST], halts[MOST];
+    const void *waits_at[MOST], *halts_at[MOST];
+    bool done[MOST];
     int count, current;
 };
 static Fibres fibres;
@@ -62,13 +64,16 @@ static void part_ways() {
     abort();
 }
 
+static int first_of_warp() { return fibres.current / 32 * 32; }
+static int end_of_warp() { return first_of_warp() + 32 < fibres.count ? first_of_warp() + 32 : fibres.count; }
+
 // Lets the other lanes of a set run until they came to a place as often as this one.
-static void await(unsigned others, const long* times) {
+static void await(int first, int end, unsigned others, const long* times) {
     int lane = fibres.current;
-    for (int round = 0; round < 1000; round++) {
+    for (int round = 0; round < 1000000; round++) {
         bool all = true;
-        for (int other = 0; other < fibres.count; other++) {
-            bool missing = (others >> other & 1) && times[other] < times[lane];
+        for (int other = first; other < end && all; other++) {
+            bool missing = (others >> other % 32 & 1) && times[other] < times[lane];
             if (missing && fibres.done[other]) part_ways();
             all = all && !missing;
         }
@@ -82,8 +87,8 @@ static const double* exchange(double mine, const void* place) {
     int lane = fibres.current, turn = fibres.exchanges[lane]++ % 2;
     fibres.slots[turn][lane] = mine;
     fibres.places[turn][lane] = place;
-    await(0xffffffffu, fibres.exchanges);
-    for (int other = 0; other < fibres.count; other++) {
+    await(first_of_warp(), end_of_warp(), 0xffffffffu, fibres.exchanges);
+    for (int other = first_of_warp(); other < end_of_warp(); other++) {
         if (fibres.exchanges[other] > fibres.exchanges[lane] + 1 || fibres.places[turn][other] != place) part_ways();
     }
     return fibres.slots[turn];
@@ -92,10 +97,19 @@ __attribute__((noinline)) static void __syncwarp(unsigned peers) {
     int lane = fibres.current;
     fibres.waits[lane]++;
     fibres.waits_at[lane] = __builtin_return_address(0);
-    await(peers, fibres.waits);
-    for (int other = 0; other < fibres.count; other++) {
-        bool here = (peers >> other & 1) && fibres.waits[other] == fibres.waits[lane];
+    await(first_of_warp(), end_of_warp(), peers, fibres.waits);
+    for (int other = first_of_warp(); other < end_of_warp(); other++) {
+        bool here = (peers >> other % 32 & 1) && fibres.waits[other] == fibres.waits[lane];
         if (here && fibres.waits_at[other] != fibres.waits_at[lane]) part_ways();
+    }
+}
+__attribute__((noinline)) static void __syncthreads() {
+    int lane = fibres.current;
+    fibres.halts[lane]++;
+    fibres.halts_at[lane] = __builtin_return_address(0);
+    await(0, fibres.count, 0xffffffffu, fibres.halts);
+    for (int other = 0; other < fibres.count; other++) {
+        if (fibres.halts[other] == fibres.halts[lane] && fibres.halts_at[other] != fibres.halts_at[lane]) part_ways();
     }
 }
 #define PLACE __builtin_return_address(0)
@@ -109,16 +123,24 @@ template <class T> __attribute__((noinline)) T __shfl_sync(unsigned, T mine, int
 }
 __attribute__((noinline)) static bool __any_sync(unsigned, bool mine) {
     const double* all = exchange(mine, PLACE);
-    for (int lane = 0; lane < fibres.count; lane++) if (all[lane] != 0) return true;
+    for (int lane = first_of_warp(); lane < end_of_warp(); lane++) if (all[lane] != 0) return true;
     return false;
 }
+__attribute__((noinline)) static unsigned __ballot_sync(unsigned, bool mine) {
+    const double* all = exchange(mine, PLACE);
+    unsigned marks = 0;
+    for (int lane = first_of_warp(); lane < end_of_warp(); lane++) marks |= unsigned(all[lane] != 0) << lane % 32;
+    return marks;
+}
+inline int __popc(unsigned marks) { return __builtin_popcount(marks); }
+inline int __ffs(unsigned marks) { return __builtin_ffs((int)marks); }
 """
 
 ENTRY = r"""
 static const Problem* shared_problem;
 static int first_environment;
 #if SHARED
-static Environment copies[32 / LANES];
+static Environment copies[THREADS / LANES];
 #endif
 
 // Fills memory with what no number is and no index may be. What is read before it is set is then seen: a GPU's memory
@@ -154,17 +176,17 @@ static void simulate(Problem& problem) {
         roll(problem, index, lanes, env);
     }
 #else
-    for (int first = 0; first < environments; first += 32 / LANES) {
-        static char stacks[32][1 << 20];
+    for (int first = 0; first < environments; first += THREADS / LANES) {
+        static char stacks[THREADS][1 << 20];
 #if SHARED
         fill_unset(copies, sizeof copies);
 #endif
         shared_problem = &problem;
         first_environment = first;
-        fibres.count = environments - first < 32 / LANES ? (environments - first) * LANES : 32;
+        fibres.count = environments - first < THREADS / LANES ? (environments - first) * LANES : THREADS;
         fibres.current = 0;
         for (int lane = 0; lane < fibres.count; lane++) {
-            fibres.exchanges[lane] = fibres.waits[lane] = 0;
+            fibres.exchanges[lane] = fibres.waits[lane] = fibres.halts[lane] = 0;
             fibres.done[lane] = false;
             fibres.begun[lane] = lane == 0;
             getcontext(&fibres.contexts[lane]);
@@ -259,7 +281,7 @@ def check_memory(structure: Structure) -> None:
     size.restype = ctypes.c_ulong
     copies = re.findall(r"__shared__ static ([a-z ]+) \w+\[(\d+)\];", structure.source())
     lists = sum(SIZES[kind] * int(count) for kind, count in copies)
-    environments = 32 // structure.lanes
+    environments = structure.threads // structure.lanes
     room = structure.shared_bytes - size()
     assert copies and 0 <= room <= SHARED_ROOM * size(), f"{room} bytes more than an environment takes"
     # each list may begin up to 3 bytes after the one before, and the block's last array elsewhere

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import MutableMapping
 from functools import cache
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from ....schemas import UsageError
 from ...runtime import kernel_build
-from .structure import THREADS, Structure
+from .structure import Structure
 
 WRITTEN = (16, 17, 18)
 """Indices of the pointers to results: frames, their tangents and labels."""
+LASTING = (4, 6, 11, 14, 15)
+"""Those of what depends on a world alone: geometry, surfaces, spheres of contacts, and meshes."""
+ALIGNMENT = 256
+"""Multiple at which each of the tensors begins that are sent together [bytes]."""
+_THERE: MutableMapping[Tensor, tuple[int, int, Tensor]] = WeakTensorKeyDictionary()
+"""Copies on a device by tensor on the CPU, each with the device and with the version of which it is one."""
 MOST_LOCAL_BYTES = 512 * 1024
 """Local memory of a thread of any GPU (CUDA C++ Programming Guide, technical specifications) [B]."""
 
@@ -36,8 +45,17 @@ def require_room(structure: Structure) -> None:
 
 
 @cache
+def block_room(device: int | None) -> int:
+    """Return the memory that a block of threads may have on a CUDA device, by default torch's, if it asks [bytes]."""
+    return kernel_build.most_shared_bytes(torch.cuda.current_device() if device is None else device)
+
+
+@cache
 def _kernel(structure: Structure, device: int) -> Any:
-    return kernel_build.compiled(structure.source(), "rollout", device)
+    kernel = kernel_build.compiled(structure.source(), "rollout", device)
+    if structure.gathered:
+        kernel_build.allow_shared_bytes(kernel, structure.shared_bytes, device)
+    return kernel
 
 
 def launch(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
@@ -53,22 +71,57 @@ def launch(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tu
     """
     require_room(structure)
     device = next(tensor.device for tensor in tensors if tensor is not None)
-    blocks = -(-numbers[0] * structure.lanes // THREADS)
+    blocks = -(-numbers[0] * structure.lanes // structure.threads)
     words = [np.int32(number) for number in numbers]
-    kernel_build.launch(_kernel(structure, device.index or 0), device, blocks, THREADS, tensors, *words)
+    size = structure.shared_bytes if structure.gathered else 0
+    kernel = _kernel(structure, device.index or 0)
+    kernel_build.launch(kernel, device, blocks, structure.threads, tensors, *words, shared_bytes=size)
 
 
 def launch_away(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
     """Launch a kernel on the current CUDA device for tensors on the CPU, which are copied there and results back.
 
-    Packing a world takes a hundred operations on small tensors, which are faster on the CPU than as CUDA launches.
+    Packing a world takes a hundred operations on small tensors, which are faster on the CPU than as CUDA launches. What
+    depends on the world alone stays on the device; all else goes there in one piece.
     """
     away = [
-        None if tensor is None else torch.empty_like(tensor, device="cuda") if k in WRITTEN else tensor.to("cuda")
+        None
+        if tensor is None
+        else torch.empty_like(tensor, device="cuda", pin_memory=False)
+        if k in WRITTEN
+        else tensor
         for k, tensor in enumerate(tensors)
     ]
+    for k in LASTING:
+        away[k] = _kept_there(away[k])
+    _send([k for k, tensor in enumerate(away) if tensor is not None and not tensor.is_cuda], away)
     launch(structure, tuple(away), numbers)
     for k in WRITTEN:
         local, remote = tensors[k], away[k]
         if local is not None and remote is not None:
-            local.copy_(remote)
+            local.copy_(remote, non_blocking=local.is_pinned())
+    torch.cuda.current_stream().synchronize()
+
+
+def _kept_there(tensor: Tensor | None) -> Tensor | None:
+    """Return the copy of a tensor on the current CUDA device, made anew where the tensor is new or was changed."""
+    if tensor is None or tensor.is_inference():
+        return tensor
+    device, kept = torch.cuda.current_device(), _THERE.get(tensor)
+    if kept is None or kept[:2] != (device, tensor._version):
+        kept = device, tensor._version, tensor.to("cuda")
+        _THERE[tensor] = kept
+    return kept[2]
+
+
+def _send(which: list[int], tensors: list[Tensor | None]) -> None:
+    """Replace some tensors of a list by copies on the current CUDA device, which are sent in one piece."""
+    parts = [(k, tensor) for k in which if (tensor := tensors[k]) is not None]
+    sizes = [tensor.numel() * tensor.element_size() for _, tensor in parts]
+    starts = [0, *accumulate(-(-size // ALIGNMENT) * ALIGNMENT for size in sizes)]
+    sent = torch.empty(starts[-1], dtype=torch.uint8, pin_memory=True)
+    for (_, tensor), start, size in zip(parts, starts, sizes, strict=False):
+        sent[start : start + size].view(tensor.dtype).view(tensor.shape).copy_(tensor)
+    there = sent.to("cuda", non_blocking=True)
+    for (k, tensor), start, size in zip(parts, starts, sizes, strict=False):
+        tensors[k] = there[start : start + size].view(tensor.dtype).view(tensor.shape)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -20,13 +19,16 @@ from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..rollout import Rollout
 from ..world import State, World
-from .launch import launch, launch_away
+from .launch import block_room, launch, launch_away
 from .packing import Packed, pack, reason_against
-from .structure import FRAME_WIDTH, LABEL_WIDTH, Structure, lanes_for
+from .structure import FRAME_WIDTH, LABEL_WIDTH, SHARED_BYTES, Structure, lanes_for
 
 if TYPE_CHECKING:
     from ....datasets.capture.tracks import Track
 
+LOST = 3
+"""Place in the first body's row of a frame of the number of contacts until then for which there was no room, where a
+kernel gathers them."""
 Launch = Callable[[Structure, tuple[Tensor | None, ...], tuple[int, ...]], None]
 
 
@@ -61,7 +63,8 @@ def simulate_fused(
         driven: The command of each driven body: a track, or a prepared `Drive`; of the servos of a chain, under the
             name of the chain: a `JointCommand`.
         record_contacts: Whether to keep the contacts of every frame.
-        lanes: Threads per environment, a power of two up to 32; None for the default.
+        lanes: Threads per environment, a power of two up to 32 (up to 256 where hulls of links may touch); None for
+            the default.
 
     Returns:
         The rollout at the frame times.
@@ -73,8 +76,10 @@ def simulate_fused(
     reason = unsupported(world)
     if reason is not None:
         raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="use simulate, which can.")
-    run = launch if world.gravity.is_cuda else launch_away
-    return roll(run, world, state, times_s, driven, record_contacts, lanes)
+    device = world.gravity.device
+    run = launch if device.type == "cuda" else launch_away
+    room = block_room(device.index if device.type == "cuda" else None)
+    return roll(run, world, state, times_s, driven, record_contacts, lanes, room)
 
 
 def roll(
@@ -85,8 +90,15 @@ def roll(
     driven: Mapping[str, Track | Drive | JointCommand] | None = None,
     record_contacts: bool = False,
     lanes: int | None = None,
+    room: int = SHARED_BYTES,
 ) -> Rollout:
-    """Check and pack the arguments of `simulate_fused`, run the kernel by `run`, and return the rollout."""
+    """Check and pack the arguments of `simulate_fused`, run the kernel by `run`, and return the rollout.
+
+    `room` is the memory that a block of threads may have where it asks for it [bytes].
+
+    Raises:
+        UsageError: If there were more contacts at once than a block of threads has room for.
+    """
     require_one_kind(world.gravity, *state.tensors, times_s)
     world.once(require_physical)
     require_state(state, world.body_names)
@@ -105,9 +117,12 @@ def roll(
     batch, count, bodies = packed.table.shape[0], times_s.shape[-1], len(world.bodies)
     structure = packed.structure
     shape = (structure.contacts, batch, structure.single, dual, structure.paired)
-    chosen = lanes or lanes_for(*shape, links=0 if structure.tree is None else len(structure.tree.bodies))
-    structure = replace(structure, dual=dual).on_lanes(chosen)
-    frames = values[0].new_empty(batch, count, bodies, FRAME_WIDTH)
+    links = 0 if structure.tree is None else len(structure.tree.bodies)
+    chosen = lanes or lanes_for(*shape, links=links, hulled=structure.hulled)
+    structure = structure.launched(dual, chosen, room)
+    # a device copies into pinned memory many times faster
+    like: Any = {"dtype": values[0].dtype, "device": values[0].device, "pin_memory": run is launch_away}
+    frames = torch.empty(batch, count, bodies, FRAME_WIDTH, **like)
     frame_tangents = torch.empty_like(frames) if dual else None
     labels = values[0].new_empty(batch, count, structure.contacts, LABEL_WIDTH) if record_contacts else None
     strides = [0 if x.shape[0] == 1 else x[0].numel() for x in (*values[1:], packed.drive_last)]
@@ -115,9 +130,27 @@ def roll(
     pointers += [packed.substeps, packed.spheres, packed.drive_starts, packed.drive_last]
     pointers += [packed.mesh_numbers, packed.mesh_indices]
     run(structure, (*pointers, frames, frame_tangents, labels, None), (batch, count, world.iterations, *strides))
+    if structure.gathered:
+        require_all_contacts(structure, frames)
     if frame_tangents is not None:
         frames = dual_of(frames, frame_tangents)
     return read_frames(world, times_s, packed, frames, labels)
+
+
+def require_all_contacts(structure: Structure, frames: Tensor) -> None:
+    """Check that a kernel that gathers contacts had room for all of them, by the frames that it wrote.
+
+    Raises:
+        UsageError: If it had not.
+    """
+    lost = frames[:, -1, 0, LOST]
+    if bool((lost > 0).any()):
+        raise UsageError(
+            f"there were more contacts at once than {structure.crowd}, for which a block of threads of this GPU has "
+            f"room: {int(lost.sum())} were left out, in {int((lost > 0).sum())} of {len(lost)} rollouts.",
+            f"up to {structure.crowd}.",
+            "take the CPU (--device cpu), or fewer corners, so that fewer touch at once.",
+        )
 
 
 def _values_and_tangents(*inputs: Tensor) -> tuple[list[Tensor], list[Tensor | None]]:

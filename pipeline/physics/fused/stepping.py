@@ -16,10 +16,10 @@ from ..kinematic import Drive
 from ..world import State, World
 from .commands import Commands
 from .host import lacking, launch_on_host
-from .launch import launch
+from .launch import block_room, launch
 from .packing import Packed, pack
 from .rollout import Launch, read_frames, require_one_kind, unsupported
-from .structure import FRAME_WIDTH, lanes_for
+from .structure import FRAME_WIDTH, SHARED_BYTES, lanes_for
 
 
 class FusedStepper:
@@ -118,7 +118,8 @@ class _Resident:
         kind, bodies, cuda = packed.structure, len(packed.structure.free), packed.table.is_cuda
         if lanes is None:
             lanes = lanes_for(kind.contacts, 1, kind.single, kind.dual, kind.paired) if cuda else 1
-        structure = replace(kind, carried=True).on_lanes(lanes)
+        room = block_room(packed.table.device.index) if cuda else SHARED_BYTES
+        structure = replace(kind, carried=True).on_lanes(lanes, room)
         arrays = {
             name: getattr(packed, name).contiguous() for name in ("table", "steps", "geometry", "surfaces", "drives")
         }
@@ -128,5 +129,5 @@ class _Resident:
             turn=None if packed.turn is None else packed.turn.cpu(),
             sent=torch.empty(drives.shape, dtype=drives.dtype, pin_memory=cuda and drives.numel() > 0),
             frames=drives.new_empty(1, 2, bodies, FRAME_WIDTH),
-            carried=drives.new_zeros(1, structure.lanes, structure.carried_width),
+            carried=drives.new_zeros(1, structure.carried_rows, structure.carried_width),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 from ...runtime import kernel_build
 from ..contact_detection import FAR_M, PAIR_SMOOTHING_M
@@ -17,8 +17,13 @@ from ..joint_rows import LIMIT_TIME_S
 from ..surface_mesh import FLAT, MESH_CONTACTS, ORDER
 from .tree import COMMAND_WIDTH, FREE_ROOT, JOINT_COLUMNS, LINK_COLUMNS, Tree, listed, listed_copies, lists_bytes
 
-THREADS = 32
+WARP = 32
+THREADS = WARP
 """Threads of a block: one warp, so that few environments still spread over all multiprocessors."""
+GATHERED_THREADS = 256
+"""Threads of a block that simulates one environment in which hulls of links may touch."""
+CROWDS = (256, 128, 64)
+"""Largest numbers of contacts at once for which such a block has room; the first that fits into its memory."""
 BODY_COLUMNS, WRENCH_COLUMNS, TWIST_COLUMNS, MAGNET_COLUMNS, SURFACE_COLUMNS = 23, 10, 3, 2, 22
 TURN_COLUMNS, WORLD_COLUMNS = 4, 5
 """Columns of the table of environments, by subject, as `load` in `kernels/environment.cuh` reads them; each further
@@ -79,6 +84,7 @@ _FILES = (
     "arithmetic",  # numbers, vectors and rotations, and exchanges between the threads of an environment
     "surface",  # effects of the contact between one body and the ground
     "contact",  # what a contact of a step is
+    "parting",  # what is known of two hulls
     "chain",  # links of chains and their joints, as read from the table
     "contact_law",  # what one contact asks for, and the change of its impulse in an iteration
     "sphere_union",  # distance from the spheres of a body
@@ -94,6 +100,7 @@ _FILES = (
     "touching",  # the contacts of a pair
     "sweeps",  # iterations over impulses
     "collision",  # all contacts of a step
+    "gathered",  # contacts of an environment that a block of threads simulates
     "rollout",  # an environment from its first frame to its last, and what is written of it
 )
 """Files of `kernels/` in the order in which they are compiled, after `language`; each names its formulas' origin."""
@@ -148,8 +155,18 @@ class Structure:
     """Whether friction depends on the direction."""
     tree: Tree | None = None
     """Links of chains; None for none."""
+    crowd: int = 0
+    """Number of contacts at once for which there is room, where they are `gathered`."""
 
-    @property
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Hash of all fields: kernels are found by their structures in each launch."""
+        return hash(tuple(getattr(self, name) for name in self.__dataclass_fields__))
+
+    @cached_property
     def contacts(self) -> int:
         """Number of contacts that an environment may have."""
         return sum(count for _, _, count in self.pairs)
@@ -173,6 +190,19 @@ class Structure:
         return self.tree is not None and self.lanes > 1
 
     @property
+    def gathered(self) -> bool:
+        """Whether a block of threads simulates one environment, with all of its contacts in one list.
+
+        Hulls take long to compare, and links have many: the threads of one warp would do this one pair after another.
+        """
+        return self.shared and self.hulled
+
+    @property
+    def threads(self) -> int:
+        """Number of threads of a block."""
+        return self.lanes if self.gathered else THREADS
+
+    @property
     def shared_bytes(self) -> int:
         """Bound on the size of the copy that the threads of an environment share, `Environment` in `kernels`."""
         tree, bodies, free, pairs = self.tree or Tree(), len(self.free), max(1, sum(self.free)), max(1, len(self.pairs))
@@ -185,20 +215,58 @@ class Structure:
         marks = 2 * pairs + 4 * (bodies + links + free + 4 * self.lanes) + 16
         lasting = 40 + 5 * self.law_count + 41 * bodies + 23 * free + 3 * links + 8 * joints + dofs * (2 + tree.depth)
         flags = links + 2 * joints + 4 * roots + 4 * bodies + 128
+        if self.gathered:
+            numbers, lasts, more = self._gathered_bytes(links + free)
+            collide = 6 * tree.columns + 8 + -(-numbers // size)
+            lasting, flags = lasting + -(-lasts // size), flags + more
+            marks = 0
         return size * (lasting + max(kick, collide, place + dofs)) + marks + flags
+
+    def _gathered_bytes(self, moved: int) -> tuple[int, int, int]:
+        """Return the bytes that contacts take where they are gathered: in a step, for the next step, and beside these.
+
+        Args:
+            moved: Number of links and of free bodies.
+        """
+        number = 4 if self.single else 8
+        size, pairs = number * (2 if self.dual else 1), max(1, len(self.pairs))
+        contact = size * (16 + (self.law_count > 1)) + 16
+        parting = 8 + 4 * number + 12 * size + 2 * 132 + 32 * 14 * size
+        shown = max(self.lanes // WARP * parting, 10 * size * self.crowd)
+        listed = self.crowd * (contact + size + 4 + 4 + (size if self.areas else 0)) + shown
+        bodies = moved * (12 * size + 8) + 4 * len(self.free)
+        return listed + bodies + (2 * number + 4) * pairs, 3 * number * pairs + self.crowd * (4 + 3 * size), 64
 
     @property
     def block_bytes(self) -> int:
         """Bound on the shared memory of a block of threads."""
-        return self.shared_bytes * (THREADS // self.lanes) + lists_bytes(self._copied_lists()) + 64
+        return self.shared_bytes * (self.threads // self.lanes) + lists_bytes(self._copied_lists()) + 64
 
-    def on_lanes(self, lanes: int) -> Structure:
+    def launched(self, dual: bool, lanes: int, room: int) -> Structure:
+        """Return `on_lanes(lanes, room)` with or without derivatives, made at the first call and kept."""
+        kept: dict[tuple[bool, int, int], Structure] = self.__dict__.setdefault("_launched", {})
+        found = kept.get((dual, lanes, room))
+        if found is None:
+            found = kept[dual, lanes, room] = replace(self, dual=dual).on_lanes(lanes, room)
+        return found
+
+    def on_lanes(self, lanes: int, room: int = SHARED_BYTES) -> Structure:
         """Return the structure for a number of threads per environment, or for those that shared memory has room for.
 
         Fewer environments share a block where their copies are large; where not even one fits, each environment has
         one thread, whose copy is in its own memory.
+
+        Args:
+            lanes: Threads per environment; where hulls of links may touch, more than one are whole warps.
+            room: Memory that a block may have where it asks for it [bytes].
         """
         wanted = replace(self, lanes=lanes)
+        if wanted.gathered:
+            for crowd in CROWDS:
+                found = replace(self, lanes=max(lanes, WARP), crowd=min(crowd, self.contacts))
+                if _block_bytes(found) <= room:
+                    return found
+            return self.on_lanes(1)
         if not wanted.shared or _block_bytes(wanted) <= SHARED_BYTES:
             return wanted
         return self.on_lanes(2 * lanes if lanes < THREADS else 1)
@@ -227,7 +295,13 @@ class Structure:
     def carried_width(self) -> int:
         """Number of values that each thread keeps for the next launch, see `resume` in `kernels/environment.cuh`."""
         joints = 0 if self.tree is None else len(self.tree.joint_dofs)
-        return 1 + len(self.free) * MOTION_COLUMNS + 3 * self.slots + 1 + 5 * joints
+        impulses = 4 * self.crowd if self.gathered else 3 * self.slots
+        return 1 + len(self.free) * MOTION_COLUMNS + impulses + 1 + 5 * joints
+
+    @property
+    def carried_rows(self) -> int:
+        """Number of rows of these values of an environment."""
+        return 1 if self.gathered else self.lanes
 
     @property
     def _unrolled(self) -> bool:
@@ -291,6 +365,7 @@ class Structure:
         hulls = self.hulled
         held = not paired and (alone or self._fits_registers)
         queued = self.shared and not hulls
+        gathered = self.gathered
         # contacts with ground and surfaces may be two more of a pair than the even share of a lane
         list_room = self.slots + queued * (1 + 2 * sum(b < 0 for _, b, _ in self.pairs))
         return {
@@ -305,9 +380,11 @@ class Structure:
             "CONTACTS": self.contacts, "PAIRED": paired, "UNROLLED": self._unrolled, "HELD": held,
             "LISTED": paired or alone, "CULLED": alone, "LAWS": self.law_count, "STEP_WIDTH": 2 + 2 * self.law_count,
             "HULLS": hulls, "QUEUED": queued, "LIST_ROOM": list_room,
+            "GATHERED": gathered, "CROWD": self.crowd, "WARP": WARP,
             "PATCHES": bool(self.areas),
             "CARRIED": self.carried, "CARRIED_WIDTH": self.carried_width,
-            "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width, "THREADS": THREADS,
+            "DRIVEN": any(number >= 0 for number in self.drives), "TABLE_WIDTH": self.table_width,
+            "THREADS": self.threads,
         }  # fmt: skip
 
     def _lists(self) -> dict[str, Iterable[int]]:
@@ -354,8 +431,12 @@ def kernel_file(name: str) -> str:
     return "\n" + kernel_build.source_file(__name__, f"kernels/{name}.cuh")
 
 
-def lanes_for(contacts: int, environments: int, single: bool, dual: bool, paired: bool, links: int = 0) -> int:
-    """Return the number of threads that should share an environment, a power of two up to 32."""
+def lanes_for(
+    contacts: int, environments: int, single: bool, dual: bool, paired: bool, links: int = 0, hulled: bool = False
+) -> int:
+    """Return the number of threads that should share an environment, a power of two up to 32, or a block of them."""
+    if links > 0 and hulled:
+        return GATHERED_THREADS
     if links > 0:
         # half of the links at once: fewer threads would do them one after another
         wanted = max(min(links // 2, _MOST_SPARSE), min(contacts, _BUSY_CHAINED // max(1, environments)))

@@ -302,7 +302,7 @@ def listed_copies(lists: Mapping[str, Sequence[int]]) -> list[str]:
         f"    KEEP_LOOP for (int i = threadIdx.x; i < {len(values)}; i += THREADS) {name}[i] = {name}_list[i];"
         for name, values in lists.items()
     ]
-    return [*found, "INLINE void copy_lists() {", *copies, "    __syncwarp(0xffffffffu);", "}"]
+    return [*found, "INLINE void copy_lists() {", *copies, "    __syncthreads();", "}"]
 
 
 def _list_source(kind: str, name: str, values: Sequence[int]) -> str:

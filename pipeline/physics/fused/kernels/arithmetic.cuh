@@ -290,7 +290,8 @@ __device__ inline void write_row(Number* to, Number a, Number b, Number c, Numbe
 
 // The LANES neighbouring threads that simulate one environment; all of them hold the same state, or share one copy of
 // it (SHARED). At every exchange between threads the whole warp takes part, even if only some of its environments need
-// it: in a divergent warp an exchange takes ten times as long.
+// it: in a divergent warp an exchange takes ten times as long. Where a block simulates one environment (GATHERED), its warps
+// wait for each other, but exchange nothing by way of registers.
 struct Lanes {
     int lane;
     bool idle;  // surplus lanes without an environment, which must not write results
@@ -298,7 +299,9 @@ struct Lanes {
     __device__ bool writes() const { return !SHARED || lane == 0; }
     // Waits for the other lanes, whose writes into the one copy then are there. The whole warp takes part here, too.
     __device__ void sync() const {
-#if SHARED
+#if GATHERED
+        __syncthreads();
+#elif SHARED
         __syncwarp(FULL);
 #endif
     }
@@ -326,12 +329,12 @@ struct Lanes {
         all = from(sum, LANES - 1);
         return sum - mine;
     }
-    // Adds one to a number that other lanes may raise at the same time.
-    __device__ static void count_up(int& number) {
+    // Adds one to a number that other lanes may raise at the same time, and returns what it was.
+    __device__ static int count_up(int& number) {
 #if HOST
-        number++;
+        return number++;
 #else
-        atomicAdd(&number, 1);
+        return atomicAdd(&number, 1);
 #endif
     }
     __device__ int from(int mine, int source) const {

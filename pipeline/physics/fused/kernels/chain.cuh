@@ -110,6 +110,35 @@ struct MoveRoom {  // where lanes leave contacts for other lanes
 };
 #endif
 
+#if GATHERED
+struct CollideRoom {  // in `collide`
+    Column columns[COLUMNS + 1];
+    Contact list[CROWD];  // in the order in which threads found them
+    Real weights[CROWD];
+    short pairs[CROWD], order[CROWD];  // pair of each; places in the list by pair and number
+    int gathered;                      // also of those that have no room in it
+    union {
+        Parting partings[LANES / WARP];  // of the pairs that warps are at
+        struct {                         // what contacts show to each other, and to bodies, by their order
+            Vec first[CROWD], second[CROWD], third[CROWD];
+            Real weight[CROWD];
+        };
+    };
+#if PATCHES
+    Real totals[CROWD];
+#endif
+    Vec pushes[LINKS + FREES], moments[LINKS + FREES];  // on links and free bodies, by the contacts
+    Velocities free[LINKS + FREES];                     // of the same without contact
+    // of each of these that contacts may move: number of its contacts, and place of the first one in the list of all; these
+    // are places by order, of body b with all bits changed
+    short acting_start[LINKS + FREES], acting_first[LINKS + FREES], acting[2 * CROWD];
+    Number limits[PAIR_ROOM], nears[PAIR_ROOM];  // see `Reach`
+    bool near[PAIR_ROOM], touched[PAIR_ROOM];    // pairs that may touch, and those that do
+    short nearby[PAIR_ROOM], nearby_count;       // the first ones
+    int groups[BODIES];
+    int reached[LINKS + FREES], reached_count;  // links that are known, then LINKS + numbers of the free bodies
+};
+#else
 struct CollideRoom {  // in `collide`
     Column columns[COLUMNS + 1];
     union {
@@ -128,6 +157,7 @@ struct CollideRoom {  // in `collide`
     int groups[BODIES];
     int reached[LINKS + FREES], reached_count;  // links that are known, then LINKS + numbers of the free bodies
 };
+#endif
 
 struct SettleRoom {  // in `settle` and `spread`
     PlaceRoom place;

@@ -15,6 +15,7 @@ INLINE void share_by_area(const Lanes& lanes, const Moments& moments, const Movi
 }
 #endif
 
+#if !GATHERED
 // Finds the contacts of a body with the ground. They are appended to the list (LISTED), or each is stored in its own
 // slot.
 INLINE void touch_plane(const Problem& problem, const Environment& env, const Own& own, int p, const Mat& rotation,
@@ -100,6 +101,8 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, const Ow
 #endif
 }
 
+#endif
+
 #if SHARED
 // Finds the pairs that may touch in this step, and marks the links that belong to them.
 INLINE void find_near_pairs(const Problem& problem, Environment& env, const Lanes& lanes, const Mat* rotations,
@@ -130,6 +133,7 @@ INLINE void find_near_pairs(const Problem& problem, Environment& env, const Lane
 }
 #endif
 
+#if !GATHERED
 // Finds the contacts of a step and their impulses, and adds these to the bodies' velocities and angular momenta.
 INLINE void collide(const Problem& problem, Environment& env, Own& own, const Mat* rotations, Motion* motions,
                     Vec* velocities, Vec* spins) {
@@ -406,3 +410,4 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
 #endif
 #endif
 }
+#endif

@@ -61,7 +61,7 @@ __device__ void share_out_pair(const Lanes& lanes, Contact* list, const Real* we
     }
     for (int i = first; i < end; i++) share_out(list[i], list[i].stop_n * totals[i], weights[i]);
 }
-#else
+#elif !GATHERED
 // The same; contacts may be of several pairs of bodies. In each round every lane shows one contact.
 __device__ void share_out_pair(const Lanes& lanes, Chain& chain, Contact* list, const Real* weights, int first, int end,
                                const Motion*) {

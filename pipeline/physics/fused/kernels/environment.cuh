@@ -75,6 +75,9 @@ struct Own {  // what each lane of an environment keeps for itself
     Vec arms[SLOTS];  // of this lane's spheres, from the centre of mass, body axes
     Real radii[SLOTS];
 #endif
+#if GATHERED
+    int frame;  // the next one
+#else
     // impulses of this lane's contacts in the previous step: ground contacts in the kernel's frame, others along
     // normal and tangents
     Vec before[SLOTS];
@@ -84,6 +87,7 @@ struct Own {  // what each lane of an environment keeps for itself
 #endif
 #if RECORD
     Tally tallies[SLOTS];
+#endif
 #endif
 };
 
@@ -121,6 +125,13 @@ struct Common {  // what the lanes of an environment have in common
 #endif
 #if HULLS
     Number parted[PAIR_ROOM][3];  // of each pair, an axis that parted its hulls in an earlier step; zero for none
+#endif
+#if GATHERED
+    // numbers of the contacts of the previous step, increasing, and their impulses: those of the ground in the kernel's frame,
+    // others along normal and tangents
+    int kept_slots[CROWD], kept_count;
+    Vec kept[CROWD];
+    int lost;  // contacts until now for which there was no room
 #endif
 #if SHARED
     StepRoom room;
@@ -248,14 +259,18 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
         env.cursors[b] = 0;
 #endif
     }
+#if GATHERED
+    if (own.lanes.writes()) env.kept_count = env.lost = 0;
+#else
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) own.before[i] = none();
     own.warm = false;
 #if PAIRED
     own.kept_count = 0;
 #endif
+#endif
 #if HULLS
-    for (int p = 0; p < PAIRS; p++) {
+    DIVIDED(own.lanes, p, PAIRS) {
         for (int k = 0; k < 3; k++) env.parted[p][k] = Number(0);
     }
 #endif
@@ -274,9 +289,11 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
 #if CARRIED
 // Restores the state at the end of the last launch, if there was one since the last reset: position, orientation,
 // velocity and spin of each body, the impulses of this lane's contacts, whether any is not zero, and values, speeds and
-// impulses of the joints. There is a row of every lane, so that launches need no synchronisation.
+// impulses of the joints. There is a row of every lane, so that launches need no synchronisation; where contacts are in
+// one list, one row of all lanes with their number, and of each its number and impulse.
+#define CARRIED_ROW(env, own) (GATHERED ? (env).index : (env).index * LANES + (own).lanes.lane)
 INLINE void resume(const Problem& problem, Environment& env, Own& own) {
-    const Number* row = problem.carried + (env.index * LANES + own.lanes.lane) * CARRIED_WIDTH;
+    const Number* row = problem.carried + CARRIED_ROW(env, own) * CARRIED_WIDTH;
     if (*row++ == Number(0)) return;
     EACH_BODY
     for (int b = 0; b < BODIES; b++, row += MOTION_COLUMNS) {
@@ -288,6 +305,15 @@ INLINE void resume(const Problem& problem, Environment& env, Own& own) {
         body.velocity = vec(row[7], row[8], row[9]);
         body.spin = vec(row[10], row[11], row[12]);
     }
+#if GATHERED
+    const int count = (int)*row++;
+    DIVIDED(own.lanes, i, count) {
+        env.kept_slots[i] = (int)row[4 * i];
+        env.kept[i] = vec(row[4 * i + 1], row[4 * i + 2], row[4 * i + 3]);
+    }
+    if (own.lanes.writes()) env.kept_count = count;
+    row += 4 * CROWD;
+#else
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) own.before[i] = vec(row[3 * i], row[3 * i + 1], row[3 * i + 2]);
     row += 3 * SLOTS;
@@ -295,6 +321,7 @@ INLINE void resume(const Problem& problem, Environment& env, Own& own) {
 #if PAIRED
     for (int i = 0; i < SLOTS; i++) own.kept[i] = i;
     own.kept_count = SLOTS;
+#endif
 #endif
 #if LINKS
     for (int j = 0; j < JOINTS && own.lanes.writes(); j++, row += 5) {
@@ -308,8 +335,8 @@ INLINE void resume(const Problem& problem, Environment& env, Own& own) {
 
 // Stores the state that `resume` reads in the next launch.
 INLINE void suspend(const Problem& problem, const Environment& env, const Own& own) {
-    if (own.lanes.idle) return;
-    Number* row = problem.carried + (env.index * LANES + own.lanes.lane) * CARRIED_WIDTH;
+    if (own.lanes.idle || (GATHERED && own.lanes.lane != 0)) return;
+    Number* row = problem.carried + CARRIED_ROW(env, own) * CARRIED_WIDTH;
     *row++ = Number(1);
     EACH_BODY
     for (int b = 0; b < BODIES; b++, row += MOTION_COLUMNS) {
@@ -319,6 +346,16 @@ INLINE void suspend(const Problem& problem, const Environment& env, const Own& o
                               body.spin.x, body.spin.y, body.spin.z};
         for (int k = 0; k < MOTION_COLUMNS; k++) row[k] = numbers[k];
     }
+#if GATHERED
+    *row++ = Number(env.kept_count);
+    for (int i = 0; i < env.kept_count; i++) {
+        row[4 * i] = Number(env.kept_slots[i]);
+        row[4 * i + 1] = env.kept[i].x;
+        row[4 * i + 2] = env.kept[i].y;
+        row[4 * i + 3] = env.kept[i].z;
+    }
+    row += 4 * CROWD;
+#else
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
         row[3 * i] = own.before[i].x;
@@ -327,6 +364,7 @@ INLINE void suspend(const Problem& problem, const Environment& env, const Own& o
     }
     row += 3 * SLOTS;
     *row++ = own.warm ? Number(1) : Number(0);
+#endif
 #if LINKS
     for (int j = 0; j < JOINTS; j++, row += 5) {
         row[0] = env.chain.values[j];

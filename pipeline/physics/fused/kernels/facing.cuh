@@ -23,9 +23,7 @@ struct Facing {
     Number sharp_gap;  // to the nearest sphere, without smoothing
 };
 
-#if !HULLS
-struct Parting {};
-#else
+#if HULLS
 INLINE Hull hull_of(const Problem& problem, const Environment& env, int b) {
     Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(b), sphere_count(b)};
     Hull hull = {spheres,       env.geometry + 4LL * hull_start(b), face_count(b), edge_count(b),
@@ -122,46 +120,6 @@ INLINE int flat_face(const Problem& problem, const Environment& env, int b, cons
     return face;
 }
 
-const int NEAR_ROOM = HOST ? 64 : 32;
-struct Near {  // edges of a hull that are near another one; all of them where more are than there is room for
-    int count, listed[NEAR_ROOM];
-#if HOST
-    unsigned long long marks;  // of the listed edges by their number modulo 64
-#endif
-    INLINE void clear() {
-        count = 0;
-#if HOST
-        marks = 0;
-#endif
-    }
-    INLINE int many(int ridges) const { return count < 0 ? ridges : count; }
-    INLINE int edge(int i) const { return count < 0 ? i : listed[i]; }
-    INLINE void add(int edge) {
-        if (count == NEAR_ROOM) count = -1;
-        if (count >= 0) listed[count++] = edge;
-#if HOST
-        marks |= 1ULL << (edge & 63);
-#endif
-    }
-    INLINE bool has(int edge) const {
-#if HOST
-        if (count >= 0 && !(marks >> (edge & 63) & 1)) return false;
-#endif
-        bool found = count < 0;
-        for (int i = 0; i < count; i++) found = found || listed[i] == edge;
-        return found;
-    }
-};
-
-#if HOST
-const int MET_ROOM = 64;
-struct Met {  // edges of two hulls that may be a contact, without derivatives
-    int edge, other;  // of a, and the number of the near edge of b
-    bool leaves;      // as `edge_leaves`
-    Number gap, normal[3];
-};
-#endif
-
 #if PACKED
 struct Fan {  // edges of one hull without derivatives, one vector of numbers after another
     Number along[3][NEAR_ROOM], inward[3][NEAR_ROOM], other[3][NEAR_ROOM], both[3][NEAR_ROOM];
@@ -200,36 +158,6 @@ struct Fan {  // edges of one hull without derivatives, one vector of numbers af
 };
 #endif
 
-struct Parting {  // how two hulls part best
-    int on_a, on_b;  // faces that lie flat on each other, -1 for none: parallel to the face that parts them best
-    Number axis[3];  // normal of a face or of two edges along which the gap is largest, out of a
-    Number gap;      // no point of one hull is nearer to the other one
-    Mat turn;        // of the frame of b into that of a, with `shift`
-    Vec shift;
-    Near near_a, near_b;
-#if HOST
-    Edge placed_b[NEAR_ROOM];  // the near edges of b in the frame of a, where there is room for them
-    Met met[MET_ROOM];         // sorted by the near edge of b
-    int met_count;             // -1: there are more than there is room for
-    unsigned long long marks;  // of their edges of a by the number modulo 64
-    // Whether a slot of edges has surely no contact.
-    INLINE bool never(int slot) const { return met_count >= 0 && !(marks >> (slot / 2 & 63) & 1); }
-    INLINE void meet(int edge, int other, const Crossing& crossing) {
-        if (met_count == MET_ROOM) met_count = -1;
-        if (met_count < 0) return;
-        Met& one = met[met_count++];
-        one.edge = edge;
-        one.other = other;
-        one.leaves = crossing.leaves;
-        one.gap = plain(crossing.gap);
-        one.normal[0] = plain(crossing.normal.x);
-        one.normal[1] = plain(crossing.normal.y);
-        one.normal[2] = plain(crossing.normal.z);
-        marks |= 1ULL << (edge & 63);
-    }
-#endif
-};
-
 // The edge of body b in the frame of body a.
 INLINE Edge edge_in(const Parting& parting, const Hull& hull_b, int i) {
     return placed_edge(edge_of(hull_b, i), parting.turn, parting.shift);
@@ -237,7 +165,7 @@ INLINE Edge edge_in(const Parting& parting, const Hull& hull_b, int i) {
 
 // The near edge number `n` of body b in the frame of body a.
 INLINE Edge near_edge(const Parting& parting, const Hull& hull_b, int n) {
-#if HOST
+#if HOST || GATHERED
     if (parting.near_b.count >= 0) return parting.placed_b[n];
 #endif
     return edge_in(parting, hull_b, parting.near_b.edge(n));
@@ -352,7 +280,7 @@ INLINE void part_by_edges(const Edge& first, const Edge& second, int edge, int n
                           Parting& found, Number& most) {
     Crossing crossing;
     if (!cross_edges(first, second, crossing)) return;
-#if HOST
+#if NOTED
     if (crossing.lean > Number(OUT_OF_FACE)) return;
     if (crossing.within && plain(crossing.gap) < limit) found.meet(edge, n, crossing);
 #endif
@@ -370,7 +298,7 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
                      Parting& found) {
     int a = pair_a(p), b = pair_b(p);
     found.on_a = found.on_b = -1;
-#if HOST
+#if NOTED
     found.met_count = -1;
 #endif
     if (face_count(a) == 0 || face_count(b) == 0) return false;
@@ -391,7 +319,7 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
     found.shift = transposed(R, env.bodies[b].position - Q * env.constants[b].com - env.bodies[a].position);
     found.shift = found.shift + env.constants[a].com;
     find_near(env, a, b, hull_a, hull_b, limit + Number(SMOOTHING_M), found);
-#if HOST
+#if NOTED
     for (int n = 0; n < found.near_b.count; n++) found.placed_b[n] = edge_in(found, hull_b, found.near_b.edge(n));
     found.met_count = 0;
     found.marks = 0;
@@ -439,7 +367,7 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
 __device__ bool face_edges(const Problem& problem, const Environment& env, int p, int slot, const Mat* rotations,
                            Number limit, const Parting& parting, Facing& facing) {
     int a = pair_a(p);
-#if HOST
+#if NOTED
     const bool listed = parting.met_count >= 0;
     if (parting.never(slot)) return false;
 #else
@@ -455,7 +383,7 @@ __device__ bool face_edges(const Problem& problem, const Environment& env, int p
     if (along * along > Number(1 - PARALLEL * PARALLEL) * length2) return false;
     Number least = limit;
     int other = -1;
-#if HOST
+#if NOTED
     for (int i = 0; i < parting.met_count; i++) {
         const Met& one = parting.met[i];
         if (one.edge != slot / 2 || one.leaves != (slot % 2 == 1) || !(one.gap < least)) continue;
@@ -490,9 +418,9 @@ __device__ bool face_edges(const Problem& problem, const Environment& env, int p
 
 // Finds gap, normal and point of one slot of a pair of bodies: first come the spheres of b against the union of a, then
 // those of a against the union of b, then edges. Returns false if the gap exceeds `limit`. `known` is what is known of the
-// sphere's centre and the other body, if that was sought before.
+// sphere's centre and the other body, and `edge` the edge of that body's hull that is nearest, if these were sought before.
 __device__ bool face(const Problem& problem, const Environment& env, int p, int k, const Mat* rotations, Number limit,
-                     const Parting& parting, const Nearness* known, Facing& facing) {
+                     const Parting& parting, const Nearness* known, Facing& facing, int edge = -1) {
 #if HULLS
     int spheres_in_all = sphere_count(pair_a(p)) + sphere_count(pair_b(p));
     if (k >= spheres_in_all) {
@@ -519,7 +447,8 @@ __device__ bool face(const Problem& problem, const Environment& env, int p, int 
 #if HULLS
     if (face_count(other) > 0) {
         Hull hull = hull_of(problem, env, other);
-        if (!distance_to_hull(hull, local, second ? parting.on_b : parting.on_a, reached, distance, nearest, outward)) return false;
+        const int flat = second ? parting.on_b : parting.on_a;
+        if (!distance_to_hull(hull, local, flat, edge, reached, distance, nearest, outward)) return false;
     } else
 #endif
     {

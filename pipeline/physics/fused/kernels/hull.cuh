@@ -76,11 +76,6 @@ struct Hull {  // of a body's spheres, in its frame: see physics/hull.py
     }
 };
 
-struct Edge {  // between two faces of a hull, in any frame: see physics/edge_contact.py
-    Vec start, along, inward, other_inward;
-    Real radius, widening;
-};
-
 INLINE Edge edge_of(const Hull& hull, int i) {
     const Input& geometry = hull.spheres.geometry;
     long long row = hull.ridge(i);
@@ -97,14 +92,6 @@ INLINE Edge placed_edge(const Edge& edge, const Mat& rotation, Vec origin) {
                    rotation * edge.other_inward, edge.radius, edge.widening};
     return placed;
 }
-
-struct Crossing {  // the common normal of two edges, out of the first body
-    Vec normal;
-    Real gap, place;
-    Number lean;  // by how much the normal leans towards a face of either edge
-    bool within;  // whether its feet lie within the edges
-    bool leaves;  // whether the first edge, from its first to its second end, leaves the other body
-};
 
 // Whether two edges lean by more than a bound, up to rounding, without the root that their normal needs: most do. Threads
 // of a warp would wait for those that do not.
@@ -177,26 +164,16 @@ INLINE Number plain_edge_distance(const Hull& hull, int edge, const Number* p) {
     return root(greater((x - place) * (x - place) + y * y, Number(1e-30))) - s[3] + slope * place;
 }
 
-// As `union_distance`, for the hull of the spheres; `nearest` is the distance without derivatives. Over the flat side of
-// the face `flat`, if it is not -1, the distance is that to its plane.
-__device__ bool distance_to_hull(const Hull& hull, Vec at, int flat, Number limit, Real& distance, Number& nearest,
-                                 Vec& outward) {
-    const Number p[3] = {plain(at.x), plain(at.y), plain(at.z)};
-    const Input& geometry = hull.spheres.geometry;
-    if (flat >= 0 && hull.over_flat(flat, p)) {
-        nearest = hull.affine(flat, 0, p);
-        if (nearest > limit) return false;
-        outward = geometry.vector(hull.row + 12LL * flat);
-        distance = dot(outward, at) - geometry.at(hull.row + 12LL * flat + 3);
-        return true;
-    }
-    Number most = Number(-1e30), best = Number(-1e30);
-    int face = 0;
+// Finds the greatest height of a point over the planes of a hull, and the greatest over the faces in which its foot lies, and
+// that face. Of a point beyond a plane by more than `limit` only the first is of use.
+INLINE void over_faces(const Hull& hull, const Number* p, Number limit, Number& most, Number& best, int& face) {
+    most = best = Number(-1e30);
+    face = 0;
 #if PACKED
     Eight above = Eight{} + most;
     for (int i = 0; i < hull.faces; i += 8) above = greater(hull.affine_of_eight(i, 0, p), above);
     for (int k = 0; k < 8; k++) most = greater(most, above[k]);
-    if (most > limit) return false;
+    if (most > limit) return;
     for (int i = 0; i < hull.faces; i += 8) {
         const Eight height = hull.affine_of_eight(i, 0, p), second = hull.affine_of_eight(i, 1, p),
                     third = hull.affine_of_eight(i, 2, p);
@@ -219,6 +196,33 @@ __device__ bool distance_to_hull(const Hull& hull, Vec at, int flat, Number limi
         face = i;
     }
 #endif
+}
+
+// Whether the distance of a point from a hull that is no more than `limit` is that from an edge.
+INLINE bool nears_edge(const Hull& hull, const Number* p, int flat, Number limit) {
+    if (flat >= 0 && hull.over_flat(flat, p)) return false;
+    Number most, best;
+    int face;
+    over_faces(hull, p, limit, most, best, face);
+    return !(most > limit) && !(best > Number(0) || best >= most - Number(SAME_PLANE_M));
+}
+
+// As `union_distance`, for the hull of the spheres; `nearest` is the distance without derivatives. Over the flat side of
+// the face `flat`, if it is not -1, the distance is that to its plane. `edge` is the nearest one, -1 where it is to be sought.
+__device__ bool distance_to_hull(const Hull& hull, Vec at, int flat, int edge, Number limit, Real& distance,
+                                 Number& nearest, Vec& outward) {
+    const Number p[3] = {plain(at.x), plain(at.y), plain(at.z)};
+    const Input& geometry = hull.spheres.geometry;
+    if (flat >= 0 && hull.over_flat(flat, p)) {
+        nearest = hull.affine(flat, 0, p);
+        if (nearest > limit) return false;
+        outward = geometry.vector(hull.row + 12LL * flat);
+        distance = dot(outward, at) - geometry.at(hull.row + 12LL * flat + 3);
+        return true;
+    }
+    Number most, best;
+    int face;
+    over_faces(hull, p, limit, most, best, face);
     if (most > limit) return false;  // no point of the hull is nearer than any of its planes
     if (best > Number(0) || best >= most - Number(SAME_PLANE_M)) {
         long long row = hull.row + 12LL * face;
@@ -227,13 +231,17 @@ __device__ bool distance_to_hull(const Hull& hull, Vec at, int flat, Number limi
         nearest = best;
         return true;
     }
-    nearest = Number(1e30);
-    int edge = 0;
-    for (int i = 0; i < hull.edges; i++) {
-        Number away = plain_edge_distance(hull, i, p);
-        if (away < nearest) {
-            nearest = away;
-            edge = i;
+    if (edge >= 0) {
+        nearest = plain_edge_distance(hull, edge, p);
+    } else {
+        nearest = Number(1e30);
+        edge = 0;
+        for (int i = 0; i < hull.edges; i++) {
+            Number away = plain_edge_distance(hull, i, p);
+            if (away < nearest) {
+                nearest = away;
+                edge = i;
+            }
         }
     }
     if (nearest > limit) return false;

@@ -100,7 +100,7 @@
 #else
 #define WHERE_ON(c, impulse) (impulse)
 #endif
-#if QUEUED
+#if QUEUED || GATHERED
 #define SLOT_OF(contact) (contact)
 #else
 #define SLOT_OF(contact) ((contact) / LANES)

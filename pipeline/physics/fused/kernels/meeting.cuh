@@ -141,13 +141,13 @@ INLINE bool may_touch(const Environment& env, int p, const Mat* rotations, const
 // previous step acts until the first iteration, 0 for none.
 INLINE int make_contact(const Problem& problem, const Environment& env, bool warm, Vec before, int p, int k,
                         const Mat* rotations, const Motion* motions, Number limit, Number near, const Parting& parting,
-                        const Nearness* known, Contact& c, Real& weight) {
+                        const Nearness* known, Contact& c, Real& weight, int edge = -1) {
     int a = pair_a(p), b = pair_b(p), found = 2;
 #if !LINKS
     const Motion &ma = motions[a], &mb = motions[b];
 #endif
     Facing facing;
-    if (!face(problem, env, p, k, rotations, limit, parting, known, facing)) return 0;
+    if (!face(problem, env, p, k, rotations, limit, parting, known, facing, edge)) return 0;
     c.normal = facing.normal;
     c.arm = facing.point - env.bodies[a].position;
     c.arm_b = facing.point - env.bodies[b].position;

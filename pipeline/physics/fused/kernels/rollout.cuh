@@ -94,6 +94,9 @@ INLINE void write_frame(const Problem& problem, const Environment& env, const La
         Place at = FRAME_WIDTH * ((env.index * problem.frame_count + frame) * BODIES + b);
         Quat q = body.quat;
         write_vector(problem, at, position);
+#if GATHERED
+        if (b == 0) problem.frames[at + 3] = Number(env.lost);  // a place that is not used otherwise
+#endif
         write_row(problem.frames + at + 4, plain(q.w), plain(q.x), plain(q.y), plain(q.z));
 #if DUAL
         write_row(problem.frame_tangents + at + 4, q.w.tangent, q.x.tangent, q.y.tangent, q.z.tangent);
@@ -121,13 +124,21 @@ INLINE void write_label(const Problem& problem, Environment& env, int frame, int
 // Writes the impulse of each contact since the last frame and its present geometry, and resets the sums.
 INLINE void write_labels(const Problem& problem, Environment& env, Own& own, int frame) {
     if (own.lanes.idle) return;
+#if GATHERED
+    Mat* const rotations = env.room.rotations;
+    DIVIDED(own.lanes, b, BODIES) rotations[b] = matrix(env.bodies[b].quat);
+    own.lanes.sync();
+    KEEP_LOOP
+    for (int p = own.lanes.lane / WARP; p < PAIRS; p += LANES / WARP) {
+#else
     Mat rotations[BODIES];
     EACH_BODY
     for (int b = 0; b < BODIES; b++) rotations[b] = matrix(env.bodies[b].quat);
     EACH_PAIR
     for (int p = 0; p < PAIRS; p++) {
+#endif
         int start = contact_start(p), a = pair_a(p);
-#if !QUEUED
+#if !QUEUED && !GATHERED
         int behind = (own.lanes.lane - start % LANES + LANES) % LANES;
 #endif
 #if FIXED
@@ -135,17 +146,27 @@ INLINE void write_labels(const Problem& problem, Environment& env, Own& own, int
         searched.sphere = -1;
 #endif
 #if PAIRED
+#if GATHERED
+        Parting& parting = env.chain.room.collide.partings[own.lanes.lane / WARP];
+        if (pair_b(p) >= 0) part_by_warp(problem, env, lane_of_warp(own.lanes), p, rotations, Number(1e30), parting);
+#else
         Parting parting;
-#if HULLS
+#endif
+#if HULLS && !GATHERED
         if (pair_b(p) >= 0) part(problem, env, p, rotations, Number(1e30), parting);
 #endif
 #endif
+#if GATHERED
+        KEEP_LOOP
+        for (int k = lane_of_warp(own.lanes); k < contact_count(p); k += WARP) {
+#else
         EACH_SLOT
         for (int s = 0; s < SLOTS; s++) {
+#endif
 #if QUEUED
             int k = owned(own.lanes, start / LANES + s) - start;
             if (k < 0) continue;
-#else
+#elif !GATHERED
             int k = behind + s * LANES;
 #endif
             if (k >= contact_count(p)) continue;
@@ -200,7 +221,9 @@ INLINE void write_labels(const Problem& problem, Environment& env, Own& own, int
                 point = env.bodies[a].position + arm - vec(Real(0), Real(0), radius);
                 gap = point.z - env.ground;
             }
-#if PAIRED
+#if GATHERED
+            Tally tally = tally_of(problem, env, frame, start + k);
+#elif PAIRED
             Tally& tally = own.tallies[(start + k) / LANES];
 #else
             Tally& tally = own.tallies[s];
@@ -225,14 +248,35 @@ INLINE void write_labels(const Problem& problem, Environment& env, Own& own, int
 #endif
             write_label(problem, env, frame, start + k, tally, normal, plain(gap), point);
         }
+#if GATHERED
+        __syncwarp(FULL);  // before the next pair overwrites how these two part
+#endif
     }
+#if GATHERED
+    own.lanes.sync();
+#endif
 }
+
+#if GATHERED
+// Sets the sums until a frame to zero.
+INLINE void clear_labels(const Problem& problem, const Environment& env, Own& own, int frame) {
+    own.frame = frame;
+    const Tally zero = {};
+    DIVIDED(own.lanes, contact, CONTACTS) {
+        if (frame < problem.frame_count) tally_of(problem, env, frame, contact) = zero;
+    }
+    own.lanes.sync();
+}
+#endif
 #endif
 
 INLINE void write(const Problem& problem, Environment& env, Own& own, int frame) {
     write_frame(problem, env, own.lanes, frame);
 #if RECORD
     write_labels(problem, env, own, frame);
+#if GATHERED
+    clear_labels(problem, env, own, frame + 1);
+#endif
 #endif
 }
 
@@ -267,7 +311,9 @@ INLINE void roll(const Problem& problem, Place index, Lanes lanes, Environment& 
 #if LINKS
     spread(env, lanes);
 #endif
-#if RECORD
+#if RECORD && GATHERED
+    clear_labels(problem, env, own, 0);
+#elif RECORD
     EACH_SLOT
     for (int i = 0; i < SLOTS; i++) {
         Tally zero = {};
@@ -321,7 +367,11 @@ INLINE void roll(const Problem& problem, Place index, Lanes lanes, Environment& 
 
 #if !HOST
 extern "C" __global__ void __launch_bounds__(THREADS) rollout(PARAMETERS) {
-#if SHARED
+#if GATHERED
+    extern __shared__ __align__(16) unsigned char memory[];  // of the size that the launch asks for
+    Environment& env = *reinterpret_cast<Environment*>(memory);
+    copy_lists();
+#elif SHARED
     __shared__ Environment copies[THREADS / LANES];
     Environment& env = copies[threadIdx.x / LANES];
     copy_lists();

@@ -31,6 +31,15 @@ INLINE void note(Tally& tally, const Contact& c, const Law& law, Vec com) {
 }
 #endif
 
+#if GATHERED && RECORD
+// The sums of a contact until a frame, in the row of its label, which is written at that frame.
+INLINE Tally& tally_of(const Problem& problem, const Environment& env, int frame, int contact) {
+    static_assert(sizeof(Tally) == LABEL_WIDTH * sizeof(Number), "a label has the room of a tally");
+    const long long row = (env.index * problem.frame_count + frame) * CONTACTS + contact;
+    return *reinterpret_cast<Tally*>(problem.labels + LABEL_WIDTH * row);
+}
+#endif
+
 #if PAIRED && !LINKS
 struct Load {  // what the contacts of a pair do to their bodies: change of a's velocity and, with the sign of a, of b's
     Vec linear_a, linear_b, turn_a, turn_b;
@@ -80,6 +89,7 @@ INLINE void aim_under_load(const Law& law, Contact* list, int first, int end, co
 #endif
 
 #if SHARED
+#if !GATHERED
 // Lists the bodies that contacts may move: links that are known, then the free bodies, which come after all links.
 INLINE void list_reached(Environment& env, const Lanes& lanes) {
     CollideRoom& room = env.chain.room.collide;
@@ -97,10 +107,12 @@ INLINE void list_reached(Environment& env, const Lanes& lanes) {
     }
     lanes.sync();
 }
+#endif
 
 // The body of a place in the list of those that contacts may move.
 INLINE int body_at(int place) { return place < LINKS ? link_body[place] : free_body(place - LINKS); }
 
+#if !GATHERED
 // Changes the impulses of the contacts by one iteration where it is asked for, and sums up what they do to each body that
 // they may move. In each round every lane shows one contact; each of these bodies is summed up by one lane.
 INLINE void sweep_contacts(Environment& env, const Lanes& lanes, Contact* list, int count, const Motion* motions,
@@ -141,6 +153,8 @@ INLINE void sweep_contacts(Environment& env, const Lanes& lanes, Contact* list, 
     }
 }
 
+#endif
+
 // Moves the bodies that contacts may move by their impulses; `joints`: after one pass over the joints. In the last
 // iteration the moments are added to the angular momenta.
 INLINE void move_bodies(Environment& env, const Lanes& lanes, Motion* motions, Vec* spins, bool joints, bool last) {
@@ -166,6 +180,7 @@ INLINE void move_bodies(Environment& env, const Lanes& lanes, Motion* motions, V
 }
 #endif
 
+#if !GATHERED
 // Discards the impulses of the previous step.
 INLINE void forget(Own& own) {
     if (!own.warm) return;
@@ -257,3 +272,4 @@ INLINE void keep(const Environment& env, Own& own, const Contact* list, int coun
 #endif
     own.warm = count > 0;
 }
+#endif

@@ -1,6 +1,6 @@
 // The contacts of a pair: of two bodies, of a body with a fixed surface, of a link with the ground.
 #if PAIRED
-#if !QUEUED
+#if !QUEUED && !GATHERED
 // Finds the contacts of two bodies and distributes the effective mass among them; returns how many touch.
 __device__ int touch_pair(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
                           Motion* motions, Contact* list, Real* weights, int& count) {
@@ -79,16 +79,45 @@ INLINE bool near_surface(const Problem& problem, const Environment& env, const F
     return least_distance(problem, fixed, -2 - pair_b(p), place) - reach < margin;
 }
 
+// Makes the contact of slot `k` of a body with a fixed surface; returns whether it touches.
+INLINE bool meet_surface(const Problem& problem, const Environment& env, const Fixed& fixed, int p, int k,
+                         const Mat* rotations, const Motion* motions, Number margin, Searched& searched, Contact& c,
+                         Real& weight) {
+    const int a = pair_a(p);
+    const Motion& m = motions[a];
+    Vec center;
+    Real radius;
+    Meeting meeting;
+    if (!meet(problem, env, fixed, p, k, rotations[a], margin, searched, center, radius, meeting)) return false;
+    Real gap = meeting.distance - radius;
+    if (!(plain(gap) < margin)) return false;
+    c.normal = meeting.outward;
+    c.arm = center - env.bodies[a].position - radius * meeting.outward;
+    c.arm_b = none();
+    c.a = a;
+    c.b = -2;
+    c.slot = SLOT_OF(contact_start(p) + k);
+    Real speed = dot(m.velocity + cross(m.omega, c.arm), c.normal);
+#if LINKS
+    Real inverse_mass = Real(0), mobility = Real(0);
+    add_mobility(response(RESPONSES(env, motions), a), c.arm, c.normal, inverse_mass, mobility);
+#else
+    Vec turn = cross(c.arm, c.normal);
+    Real inverse_mass = m.inverse_mass + dot(turn, m.inverse_inertia * turn);
+    Real mobility = mobility_trace(m, c.arm);
+#endif
+    return prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weight);
+}
+
+#if !GATHERED
 // Finds the contacts of a body with a fixed surface and distributes the effective mass among them; returns how many
 // touch.
 __device__ int touch_surface(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
                              Motion* motions, Contact* list, Real* weights, int& count) {
     int a = pair_a(p), s = -2 - pair_b(p), first = count;
-    const Motion& m = motions[a];
-    Vec com = env.bodies[a].position;
     Number margin;
     Fixed fixed = fixed_surface(problem, env, s);
-    const bool near = near_surface(problem, env, fixed, p, m, margin);
+    const bool near = near_surface(problem, env, fixed, p, motions[a], margin);
 #if LINKS && !SHARED
     reveal(env, own.lanes, motions, a, near);
 #endif
@@ -97,29 +126,9 @@ __device__ int touch_surface(const Problem& problem, Environment& env, const Own
         Searched searched;
         searched.sphere = -1;
         EACH_OWNED(own.lanes, start, contact_count(p), k) {
-            Vec center;
-            Real radius, weight;
-            Meeting meeting;
-            if (!meet(problem, env, fixed, p, k, rotations[a], margin, searched, center, radius, meeting)) continue;
-            Real gap = meeting.distance - radius;
-            if (!(plain(gap) < margin)) continue;
             Contact& c = list[count];
-            c.normal = meeting.outward;
-            c.arm = center - com - radius * meeting.outward;
-            c.arm_b = none();
-            c.a = a;
-            c.b = -2;
-            c.slot = SLOT_OF(start + k);
-            Real speed = dot(m.velocity + cross(m.omega, c.arm), c.normal);
-#if LINKS
-            Real inverse_mass = Real(0), mobility = Real(0);
-            add_mobility(response(RESPONSES(env, motions), a), c.arm, c.normal, inverse_mass, mobility);
-#else
-            Vec turn = cross(c.arm, c.normal);
-            Real inverse_mass = m.inverse_mass + dot(turn, m.inverse_inertia * turn);
-            Real mobility = mobility_trace(m, c.arm);
-#endif
-            if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weight)) continue;
+            Real weight;
+            if (!meet_surface(problem, env, fixed, p, k, rotations, motions, margin, searched, c, weight)) continue;
             if (own.warm) {
                 Vec along = own.before[(start + k) / LANES], one, two;
                 tangents(env, c.normal, one, two);
@@ -132,35 +141,45 @@ __device__ int touch_surface(const Problem& problem, Environment& env, const Own
     return count - first;
 }
 #endif
+#endif
 
 #if LINKS
+// Makes the contact of slot `k` of a body with the ground; returns whether it touches.
+INLINE bool meet_ground(const Problem& problem, const Environment& env, int p, int k, const Mat* rotations,
+                        const Motion* motions, Contact& c, Real& weight) {
+    const int a = pair_a(p), contact = contact_start(p) + k;
+    const long long row = env.geometry + 4LL * problem.spheres[contact];
+    Vec up = vec(Real(0), Real(0), Real(1));
+    c.arm = rotations[a] * (problem.geometry.vector(row) - env.constants[a].com) - problem.geometry.at(row + 3) * up;
+    c.normal = up;
+    c.arm_b = none();
+    c.a = a;
+    c.b = -1;
+    c.slot = SLOT_OF(contact);
+    Real gap = env.bodies[a].position.z - env.ground + c.arm.z, inverse_mass = Real(0), mobility = Real(0);
+    Real speed = relative_velocity(c, motions).z;
+    add_mobility(response(RESPONSES(env, motions), a), c.arm, up, inverse_mass, mobility);
+    return prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weight);
+}
+
+#if !GATHERED
 // Finds the contacts of a link with the ground, and distributes the effective mass among them as between two bodies.
 __device__ int touch_plane_link(const Problem& problem, Environment& env, const Own& own, int p, const Mat* rotations,
                                 Motion* motions, Contact* list, Real* weights, int& count) {
-    int a = pair_a(p), first = count, start = contact_start(p);
+    int first = count, start = contact_start(p);
 #if !SHARED
-    reveal(env, own.lanes, motions, a, true);
+    reveal(env, own.lanes, motions, pair_a(p), true);
 #endif
-    Vec up = vec(Real(0), Real(0), Real(1));
     EACH_OWNED(own.lanes, start, contact_count(p), k) {
-        long long row = env.geometry + 4LL * problem.spheres[start + k];
         Contact& c = list[count];
-        c.arm = rotations[a] * problem.geometry.vector(row) - problem.geometry.at(row + 3) * up;
-        c.normal = up;
-        c.arm_b = none();
-        c.a = a;
-        c.b = -1;
-        c.slot = SLOT_OF(start + k);
-        Real gap = env.bodies[a].position.z - env.ground + c.arm.z, inverse_mass = Real(0), mobility = Real(0);
-        Real speed = relative_velocity(c, motions).z;
-        add_mobility(response(RESPONSES(env, motions), a), c.arm, up, inverse_mass, mobility);
-        if (!prepare(c, env.laws[pair_law(p)], gap, speed, inverse_mass, mobility, weights[count])) continue;
+        if (!meet_ground(problem, env, p, k, rotations, motions, c, weights[count])) continue;
         c.impulse = own.before[(start + k) / LANES];
         count++;
     }
     if (own.lanes.any(count > first)) share_out_pair(SHOWN_TO(own.lanes, env), list, weights, first, count, motions);
     return count - first;
 }
+#endif
 #endif
 
 // Divides the effective mass of a body by the number of groups of contacts on it; `groups` counts them by body.

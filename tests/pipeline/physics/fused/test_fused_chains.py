@@ -14,18 +14,19 @@ from cgwm.pipeline.physics.chain import Chain, Joint
 from cgwm.pipeline.physics.chain_state import with_joints
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
-from cgwm.pipeline.physics.fused import simulate_fused
+from cgwm.pipeline.physics.fused import simulate_fused, structure
 from cgwm.pipeline.physics.fused.launch import require_room
 from cgwm.pipeline.physics.fused.packing import pack, reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import SHARED_BYTES, Structure
+from cgwm.pipeline.physics.hull import Hull
 from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.runtime import kernel_build
 from cgwm.schemas import UsageError
-from helpers import fused_host
+from helpers import fixed_surfaces, fused_host
 from helpers.chains import chained, double_pendulum, drawer, link, still
-from helpers.worlds import F64, ball_body, batch, times
+from helpers.worlds import F64, ball_body, batch, box_body, plate_body, times
 
 CUDA = torch.cuda.is_available() and kernel_build.available()
 NEEDS_GPU = pytest.mark.skipif(not CUDA, reason="needs a CUDA device and cuda.core")
@@ -236,22 +237,95 @@ def long_chain(links: int) -> Structure:
     return pack(world, still(links + 1), times(0.01), {}, False).structure
 
 
+def boxed(body: Body, half: tuple[float, float, float]) -> Body:
+    """Return a body with the hull of a box about its centre of mass."""
+    shape = box_body(half)
+    centers = shape.centers + body.com[:, None]
+    return replace(body, centers=centers, radii=shape.radii, hull=Hull.of(centers[0], shape.radii[0], torch.arange(8)))
+
+
+def hulled_hand() -> Case:
+    """Return the hand on a driven palm, with boxes for links, and a plate on ground and box, which it squeezes."""
+    world, state, commands = hand("driven")
+    palm, left, left_tip, right, right_tip, *rest, _ = world.bodies
+    links = [boxed(body, (0.03, 0.008, 0.012)) for body in (left, left_tip, right, right_tip)]
+    plate = plate_body((0.03, 0.025, 0.02), 0.1, points=1)
+    shelf = fixed_surfaces.box((0.05, 0.05, 0.01), position=(0.15, 0.0, -0.0502))
+    bodies = (boxed(palm, (0.01, 0.04, 0.02)), *links, *rest[:-1], boxed(rest[-1], (0.01, 0.01, 0.03)), plate)
+    world = replace(world, bodies=bodies, surfaces=(shelf,))
+    state.position_m[:, -1] = torch.tensor([0.1, 0.0, -0.021])
+    return world, state, commands
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("lanes", [32, 96])
+def test_hulls_of_links_touch_in_a_block_of_threads(fused: Fused, lanes: int) -> None:
+    """Also what the ground and a fixed surface do to them, by areas, and what labels say of it."""
+    world, state, commands = hulled_hand()
+    when = times(0.04, 100.0)
+    expected = simulate(world, state, when, commands, record_contacts=True)
+    found = fused(world, state, when, commands, True, lanes=lanes)
+    assert expected.contacts is not None and found.contacts is not None
+    acted = expected.contacts.impulse_n_s.norm(dim=-1).sum((0, 1)) > 0
+    pairs = zip(expected.contacts.body_a[acted].tolist(), expected.contacts.body_b[acted].tolist(), strict=True)
+    assert {(8, -1), (8, -2), (5, 8), (8, 0), (2, 8)} <= set(pairs)  # ground, surface, two links and the palm
+    for name in POSES:
+        np.testing.assert_allclose(getattr(found, name).cpu(), getattr(expected, name), atol=1e-9, err_msg=name)
+    for name in ("impulse_n_s", "distance_m", "normal", "position_m"):
+        mine, theirs = getattr(found.contacts, name).cpu(), getattr(expected.contacts, name)
+        np.testing.assert_allclose(mine, theirs, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.evidence
+def test_derivatives_of_hulls_of_links_in_a_block_of_threads(fused: Fused) -> None:
+    world, state, commands = hulled_hand()
+
+    def moved(run: Callable[..., Rollout]) -> Callable[[torch.Tensor, int], torch.Tensor]:
+        def final(x: torch.Tensor, _: int) -> torch.Tensor:
+            changed = world.with_body(len(world.bodies) - 1, mass=world.bodies[-1].mass + 0.01 * x[:, 0])
+            start = with_joints(changed, state, {"l1": -0.05 + x[:, 1]}, {"r1": 0.3 + x[:, 2]})
+            found = run(changed, start, times(0.016, 125.0), commands)
+            return torch.cat([getattr(found, name)[:, -1].flatten(1) for name in POSES], -1)
+
+        return final
+
+    point = torch.zeros(1, 3, dtype=F64)
+    value, jacobian = batched_jacobian(moved(simulate), point)
+    found, derivative = batched_jacobian(moved(partial(fused, lanes=64)), point)
+    np.testing.assert_allclose(found.cpu(), value, atol=1e-10)
+    assert (jacobian.abs().amax((0, 1)) > 1e-6).all()
+    np.testing.assert_allclose(derivative.cpu(), jacobian, atol=1e-8 * float(jacobian.abs().max()))
+
+
+@pytest.mark.evidence
+def test_contacts_without_room_are_counted_and_refused(fused: Fused, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(structure, "CROWDS", (6,))
+    world, state, commands = hulled_hand()
+    with pytest.raises(UsageError, match=r"(?s)more contacts at once than 6.* in 1 of 1 rollouts.*--device cpu"):
+        fused(world, state, times(0.04, 100.0), commands, lanes=32)
+
+
+def test_a_block_has_room_for_as_many_contacts_as_its_memory_holds() -> None:
+    world, state, commands = hulled_hand()
+    hand = replace(pack(world, state, times(0.01), commands, False).structure, pairs=((1, 2, 144),) * 90)
+    found = [
+        hand.on_lanes(lanes, room)
+        for lanes, room in ((8, 227 << 10), (256, 227 << 10), (256, 72 << 10), (256, 8 << 10))
+    ]
+    assert [(each.lanes, each.crowd, each.threads) for each in found] == [
+        (32, 256, 32), (256, 256, 256), (256, 128, 256), (1, 0, 32)
+    ]  # fmt: skip
+    assert found[2].block_bytes <= 72 << 10 < replace(found[2], crowd=256).block_bytes
+    with pytest.raises(UsageError, match=r"(?s)may have 12960 contacts at once.*--device cpu"):
+        require_room(found[3])
+
+
 def test_environments_of_a_block_are_as_many_as_its_memory_holds() -> None:
     short, middle, endless = (long_chain(links) for links in (3, 10, 150))
     assert [short.on_lanes(lanes).lanes for lanes in (1, 4, 32)] == [1, 4, 32]
     assert [middle.on_lanes(lanes).lanes for lanes in (1, 4, 32)] == [1, 8, 32]
     assert middle.on_lanes(4).block_bytes <= SHARED_BYTES < 8 * middle.on_lanes(4).shared_bytes
     assert endless.on_lanes(32).lanes == 1 and not endless.on_lanes(32).shared
-
-
-def test_more_contacts_than_a_thread_has_room_for_are_refused() -> None:
-    """A LEAP hand whose fingers touch each other has 11,880 possible contacts, and one copy no room in a block."""
-    pairs = tuple((0, 1, 60) for _ in range(198))
-    hand = replace(long_chain(2), pairs=pairs)
-    with pytest.raises(UsageError, match=r"(?s)may have 11880 contacts at once.*up to 4096\..*--device cpu") as refused:
-        require_room(hand)
-    assert refused.value.exit_code == 2
-    require_room(replace(hand, pairs=pairs[:60]))
 
 
 def test_a_hand_of_160_spheres_and_two_objects_of_250_stay_in_the_kernel() -> None:
