@@ -93,6 +93,7 @@ class HandWorld:
         velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
         omega_body_rad_s: ArrayLike = (0.0, 0.0, 0.0),
         speeds: Mapping[str, float] | None = None,
+        placed: bool = True,
     ) -> State:
         """Return the state (1, nb, ...) of all bodies from pose and velocities of the object and values of the joints.
 
@@ -103,6 +104,7 @@ class HandWorld:
             velocity_m_s: Velocity of the object [m/s], shape (3,).
             omega_body_rad_s: Its angular velocity [rad/s], shape (3,).
             speeds: Speeds of the joints [rad/s]; 0 for those that are left out.
+            placed: Whether poses of links are wanted, which rollouts do not need.
         """
         count = len(self.world.bodies)
         position, velocity, omega = (torch.zeros(1, count, 3, dtype=torch.float64) for _ in range(3))
@@ -113,7 +115,7 @@ class HandWorld:
         for field, value in ((position, position_m), (quat, quat_wxyz), (velocity, velocity_m_s),
                              (omega, omega_body_rad_s)):  # fmt: skip
             field[0, -1] = torch.as_tensor(np.asarray(value, float))
-        return with_joints(self.world, State(position, quat, velocity, omega), joints, speeds)
+        return with_joints(self.world, State(position, quat, velocity, omega), joints, speeds, placed)
 
 
 def hand_world(model: Model, task: HandTask) -> HandWorld:

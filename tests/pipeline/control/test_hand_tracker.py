@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import hand_start
 from cgwm.pipeline.control.hand_plant import HandModelPlant
+from cgwm.pipeline.control.hand_tracker import _Trial
 from cgwm.pipeline.control.horizon import Targets
 from cgwm.pipeline.control.loop import Sensor
+from cgwm.pipeline.control.planning import ControlState
 from cgwm.schemas import FittedParameter
 from helpers import fused_host
 from helpers.paddles import hand_task, write_hand
@@ -71,16 +74,34 @@ def test_noisy_poses_are_filtered_while_the_object_is_pushed(unsure: tuple[Path,
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_the_draw_that_predicts_the_motion_is_planned_with(unsure: tuple[Path, Model], factor: float) -> None:
+def test_the_draw_that_predicts_the_motion_agrees_best(unsure: tuple[Path, Model], factor: float) -> None:
     controller = HandController(unsure[1], hand_task(unsure[0]), draws=5)
     estimate = float(controller.hand.world.contact.friction)
     assert float(controller._planned_in().batch(()).contact.friction) == estimate  # nothing was seen
     errors = errors_while_pushing(controller, friction_factor=factor)
     np.testing.assert_allclose(errors, 0.0, atol=1e-7)  # exact poses are believed
     draws = controller._tracker._worlds.batch(tuple(range(6))).contact.friction.flatten()
-    chosen = float(controller._planned_in().batch(()).contact.friction)
-    nearest = float(draws[(draws / estimate / factor).log().abs().argmin()])
-    assert chosen == pytest.approx(nearest)
+    nearest = int((draws / estimate / factor).log().abs().argmin())
+    assert controller._tracker._behind.argmin() == nearest
+
+
+@pytest.mark.parametrize(("better", "chosen"), [(0.0, 0), (0.6, 2)])
+def test_a_draw_is_planned_with_that_predicted_better_by_more_than_chance(
+    unsure: tuple[Path, Model], better: float, chosen: int
+) -> None:
+    """Errors of five draws by chance, of 30 pieces of time, of which those of the third are less."""
+    controller = HandController(unsure[1], hand_task(unsure[0], sensing=NOISE), draws=5)
+    tracker, rng, place = controller._tracker, np.random.default_rng(0), np.array([0.1, 0.0, 0.2])
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    for _ in range(30):
+        error = 0.004 * rng.normal(size=(6, 3))
+        error[2] *= 1 - better
+        motion = torch.as_tensor(place + error), torch.as_tensor(np.tile(upright, (6, 1)))
+        tracker._weigh(
+            _Trial(0.0, motion), ControlState(time_s=0.2, joints={}, position_m=place, quat_wxyz=upright), 0.2
+        )
+    assert tracker.draw == chosen
+    assert tracker._behind.argmin() != 0  # one seems better in any case
 
 
 def test_late_states_are_predicted_by_what_was_sent(unsure: tuple[Path, Model]) -> None:
