@@ -124,7 +124,8 @@ def select_next(
     if flight.noise_model != WHITE:
         equals = _with_unproven(equals, done, linear.episode)
     equals = _simplest_within(equals, done, linear, kept, variants)
-    named = not are_slight(equals) and (
+    told = len(equals) <= LIMITS.most_equals and not are_slight(equals)
+    named = told and (
         flight.noise_model == WHITE or any(repeats(e, len(evidence)) for e in equals)  # the level is that of all tests
     )
     return SelectionStep(tuple(ranking), tuple(equals), named)

@@ -2,13 +2,17 @@
 
 A force may also swing: at so many periods in a usual flight, in one of four phases. A torque that swings does so about
 an axis of the world, since none that a body has of its own is known to any effect.
+
+What a law is least known in is the coordinate that it follows: a drag that is none is likelier to follow the speed in
+another way than to act on one side of the room. Before the data, the families of such coordinates are together as
+likely as all others. Nothing is known that pushes a body in one direction of the world, by how fast it spins.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +21,7 @@ from torch import Tensor
 
 from ..physics.effects.effect import ActiveEffect
 from ..segments.force_fields import FlownMotion, ForceField
+from .coupled_effects import DRAGS
 from .own_tilt import OWN_TILTS
 from .thresholds import THRESHOLDS
 
@@ -24,6 +29,13 @@ LIMITS = THRESHOLDS.forms
 
 UPWARD = ("gravity_scale", "length_scale", "clock_scale")
 """Effects that change the fall, and nothing across it."""
+FOLLOWS = {
+    **dict.fromkeys(DRAGS, ("speed",)),
+    "magnus_lift": ("speed", "spin"),
+    "spin_damping": ("spin",),
+    "ground_magnet": ("height",),
+}
+"""Coordinates that the law of an effect follows."""
 OTHER_DRAG = {("linear_drag", 1): "quadratic_drag", ("quadratic_drag", -1): "linear_drag"}
 """Powers of the speed that make one drag of the library another one."""
 
@@ -31,6 +43,8 @@ OTHER_DRAG = {("linear_drag", 1): "quadratic_drag", ("quadratic_drag", -1): "lin
 class Family(NamedTuple):
     """Forms of a force that differ in one coordinate."""
 
+    coordinate: str
+    """The coordinate."""
     forms: dict[str, ForceField]
     """Each by a description in words."""
     then: str
@@ -78,18 +92,34 @@ def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) ->
     same = "the same torque" if bool(own.turning.any()) else "the same force"
     place = dict(zip(("x", "y", "height"), motion.com_m.unbind(-1), strict=True))
     level = {**_where(motion, "x", place["x"]), **_where(motion, "y", place["y"])}
-    factors = {
-        "record shorter and longer flights": _when(motion),
-        "record lower and higher flights": _where(motion, "height", place["height"]),
-        "record flights elsewhere": level,
-        "record slower and faster flights": _how_fast(motion, "speed", motion.velocity_m_s, named),
-        "record flights with less and with more spin": _how_fast(motion, "spin", motion.omega_rad_s),
+    found = {
+        "time": (_when(motion), "record shorter and longer flights"),
+        "height": (_where(motion, "height", place["height"]), "record lower and higher flights"),
+        "place": (level, "record flights elsewhere"),
+        "speed": (_how_fast(motion, "speed", motion.velocity_m_s, named), "record slower and faster flights"),
+        "spin": (
+            {} if _is_constant(own) else _how_fast(motion, "spin", motion.omega_rad_s),
+            "record flights with less and with more spin",
+        ),
     }
-    found = [
-        Family({f"{same} {words}": own.times(factor) for words, factor in family.items()}, then)
-        for then, family in factors.items()
+    families = [
+        Family(coordinate, {f"{same} {words}": own.times(factor) for words, factor in factors.items()}, then)
+        for coordinate, (factors, then) in found.items()
     ]
-    return [family for family in (*found, _swinging(motion, own)) if family.forms]
+    return [family for family in (*families, _swinging(motion, own)) if family.forms]
+
+
+def weights_of(families: Sequence[Family], name: str) -> list[float]:
+    """Return how likely each family of other forms of an effect is before the data, in units of the least likely."""
+    own = [family.coordinate in FOLLOWS.get(name, ()) for family in families]
+    near = max(len(own) - sum(own), 1) / max(sum(own), 1)
+    return [near if one else 1.0 for one in own]
+
+
+def _is_constant(field: ForceField) -> bool:
+    """Return whether a force has the same size and direction in the world in all frames, and no torque."""
+    first = field.acceleration[:1, :1]
+    return not bool(field.turning.any()) and bool((field.acceleration - first).abs().max() <= 1e-6 * first.abs().max())
 
 
 def _usual_flight_s(lengths_s: Tensor) -> float:
@@ -123,7 +153,7 @@ def _swinging(motion: FlownMotion, own: ForceField) -> Family:
         swing = torch.sin(math.pi * (2 * periods * since / usual + phase))
         at = f" in phase {180 * phase:.0f} deg" if phase else ""
         found[f"{words}, swinging at {periods / usual:.2g} Hz{at}"] = own.times(swing)
-    return Family(found, "record longer flights")
+    return Family("swinging", found, "record longer flights")
 
 
 def _where(motion: FlownMotion, name: str, values: Tensor) -> Mapping[str, Tensor]:

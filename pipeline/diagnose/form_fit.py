@@ -38,8 +38,6 @@ class FormCost(NamedTuple):
     """Chi2, up to a constant."""
     scatter: float
     """Factor by which variances between episodes exceed those of the noise; at least 1."""
-    counts: float
-    """Degrees of freedom of that factor."""
 
 
 class Scales(NamedTuple):
@@ -158,10 +156,8 @@ class FormFit:
             return self.in_its_stead(form, dispersion)
         own = self.information[:, form]
         q, dof = _scatter(own[:, :, form], self.score[:, form] - own @ step)
-        counts = LIMITS.model_counts + dof
-        return FormCost(
-            self._cost(step) / dispersion, max(1.0, (LIMITS.model_counts + q / dispersion) / counts), counts
-        )
+        scatter = (LIMITS.model_counts + q / dispersion) / (LIMITS.model_counts + dof)
+        return FormCost(self._cost(step) / dispersion, max(1.0, scatter))
 
     @cached_property
     def _total(self) -> tuple[Array, Array]:

@@ -8,12 +8,12 @@ one of these alone, or swinging in time. Each takes its place in flights lineari
 the other effects fitted again, and has as many numbers; a torque that swings has those of its axis, which cost what
 they do in BIC.
 
-Before the data, no form of a family is likelier than another, no family likelier than another, and all together are as
-likely as the law that is named, or the laws where flights do not tell two drags apart; the odds are those of the mean
-likelihoods. No model of errors is exact, and how the numbers of a force scatter from episode to episode tells how far
-it can be believed (`falsification`). The law of least chi2 says that scatter, since a wrong one scatters by what it
-misses: with d degrees of freedom, which this scatter s is known to, a law whose chi2 is larger by x has the likelihood
-(1 + x / (d s))^(-d/2), that of Student's distribution.
+Before the data, no form of a family is likelier than another, and all together are as likely as the law that is named,
+or the laws where flights do not tell two drags apart; how likely the families are, `form_families` says. Where flights
+do not tell several effects of the library apart, each is as likely as another, and each that is a force may have
+another form, but an error of a scale or a frame has none. The odds are those of the mean likelihoods. No model of
+errors is exact, and how the numbers of a force scatter from episode to episode tells how far it can be believed
+(`falsification`): variances count as often as the law of least chi2 says, since a wrong one scatters by what it misses.
 
 What else acts need not be named yet: the push of a wind that is too small to be named bends the law of the drag through
 which it acts, and another power of the speed follows that, too. Each law, that of the name and every other one, is
@@ -37,7 +37,7 @@ from ..segments.candidates import Candidate, acts_in, admissible, variants_of
 from ..segments.force_fields import FlownMotion
 from ..segments.segments import Segments
 from .coupled_effects import DRAGS
-from .form_families import Family, families_of, laws_of, own_field
+from .form_families import Family, families_of, laws_of, own_field, weights_of
 from .form_fit import FormCost, FormFit, Scales
 from .session_scales import apart, linearize_beside_scales, members, scale_spread
 from .thresholds import THRESHOLDS
@@ -105,8 +105,14 @@ def other_forms(
         laws, families = laws_of(motion, own, named), families_of(motion, own, named)
         forms = {words: field for family in families for words, field in family.forms.items()}
         fit = FormFit.of(motion, active[named[0]], [*laws, *forms.values()], more, scales)
-        found.append(_compared(fit, named[0], len(laws), families, dispersion))
+        found.append(_compared(fit, named[0], len(laws), families, dispersion, _forces(named, candidates)))
     return found
+
+
+def _forces(named: Sequence[str], candidates: Sequence[Candidate]) -> float:
+    """Return the share of an effect and its equals that are forces, of which there are other forms."""
+    errors = {one.effect.name for one in candidates if one.effect.phase == "measurement"}
+    return max(sum(name not in errors for name in named), 1) / len(named)
 
 
 def _scales(flight: Segments, candidates: Sequence[Candidate], groups: Sequence[int]) -> Scales | None:
@@ -125,7 +131,9 @@ def _alike(named: Sequence[str]) -> set[str]:
     return found | set(DRAGS) if named[0] in DRAGS else found
 
 
-def _compared(fit: FormFit, name: str, laws: int, families: Sequence[Family], dispersion: float) -> OtherForms:
+def _compared(
+    fit: FormFit, name: str, laws: int, families: Sequence[Family], dispersion: float, forces: float = 1.0
+) -> OtherForms:
     """Compare an effect with families of other forms, each with one more effect or not.
 
     Args:
@@ -134,6 +142,7 @@ def _compared(fit: FormFit, name: str, laws: int, families: Sequence[Family], di
         laws: How many laws these are, none likelier than another.
         families: The other forms.
         dispersion: Factor by which variances exceed those of the noise.
+        forces: Share of the effect and its equals that may have other forms.
     """
     forms = [words for family in families for words in family.forms]
     tried = [_tried(fit, columns, dispersion) for columns in fit.forms]
@@ -153,8 +162,9 @@ def _compared(fit: FormFit, name: str, laws: int, families: Sequence[Family], di
     half = {words: log - own for words, log in zip(forms, logs[laws:], strict=True)}
     best = max(half, key=lambda one: half[one])
     together = [_log_mean([half[words] for words in family.forms]) for family in families]
+    odds = 2 * (_log_mean(together, weights_of(families, name)) + math.log(forces))
     then = next(family.then for family in families if best in family.forms)
-    return OtherForms(effect=name, words=best, gain=2 * half[best], odds=2 * _log_mean(together), then=then)
+    return OtherForms(effect=name, words=best, gain=2 * half[best], odds=odds, then=then)
 
 
 Tried = list[list[list[tuple[FormCost, int]]]]
@@ -177,13 +187,12 @@ def _tried(fit: FormFit, form: Sequence[int], dispersion: float) -> Tried:
 def _log(cost: FormCost, more: int, likeliest: FormCost, count: float) -> float:
     """Return the logarithm of a likelihood against that of the least chi2, of a form with so many numbers more.
 
-    How far variances exceed those of the noise is what the form of least chi2 says; that it is not known makes the
-    likelihood one of Student's.
+    How far variances exceed those of the noise is what the form of least chi2 says.
     """
-    excess = (cost.chi2 - likeliest.chi2) / (likeliest.counts * likeliest.scatter)
-    return -0.5 * (likeliest.counts * math.log1p(excess) + more * math.log(count))
+    return -0.5 * ((cost.chi2 - likeliest.chi2) / likeliest.scatter + more * math.log(count))
 
 
-def _log_mean(values: Sequence[float]) -> float:
-    """Return the logarithm of the mean of exponentials."""
-    return float(np.logaddexp.reduce(values)) - math.log(len(values))
+def _log_mean(values: Sequence[float], weights: Sequence[float] = ()) -> float:
+    """Return the logarithm of the mean of exponentials, weighted where weights are given."""
+    logs = np.log(np.array(weights)) if weights else np.zeros(len(values))
+    return float(np.logaddexp.reduce(np.array(values) + logs) - np.logaddexp.reduce(logs))

@@ -90,8 +90,9 @@ def find(
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
     note("diagnose: held-out episodes")
     errors = _errors(contact, flown)
-    # what flights show may be what contact imitates, but for what does not repeat
-    limits, imitated = THRESHOLDS.segments, flown.recurs or bool(flown.own)
+    # what flights show may be what contact imitates, but for a misfit alone that does not repeat
+    limits = THRESHOLDS.segments
+    imitated = flown.recurs or bool(flown.own) or (flown.remains and bool(flown.in_flight))
     contact = _without_useless(contact, limits.confirmed if imitated else -limits.worse_t)
     in_contact = any(one.where == "contact" for one in contact.chosen)
     misfits = () if contact.segments is None or in_contact else misfits_of(contact.segments)

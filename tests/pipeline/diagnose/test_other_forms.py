@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose import wording
-from cgwm.pipeline.diagnose.other_forms import OtherForms, other_forms
+from cgwm.pipeline.diagnose.form_families import Family, weights_of
+from cgwm.pipeline.diagnose.other_forms import OtherForms, _forces, _log_mean, other_forms
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.effect import BodyMotion, Effect, EffectParameter, Values, Wrench
 from cgwm.pipeline.physics.world import World
@@ -116,7 +117,7 @@ def test_the_law_of_a_true_effect_is_likelier_than_its_forms(name: str, values: 
 @pytest.mark.parametrize(("push", "word"), [(late, "flight"), (swinging, "swinging at")])
 def test_a_force_that_sets_in_late_or_swings_is_no_other_gravity(push: Callable[[Array], Array], word: str) -> None:
     found = form_of(world_with("ball"), "gravity_scale", push)
-    assert found.likelier and word in found.words
+    assert found.likelier and word in found.words and "spin" not in found.words
 
 
 def test_a_drag_above_a_speed_is_no_drag() -> None:
@@ -132,6 +133,17 @@ def test_where_two_drags_are_not_told_apart_other_forms_have_to_beat_both() -> N
     (alone,), (either,) = forms_of(ball, data, ["linear_drag"]), forms_of(ball, data, ["linear_drag"], "quadratic_drag")
     assert alone.likelier and alone.words == "the same force times the speed to the power 1"
     assert not either.likelier
+
+
+def test_forms_that_differ_in_what_a_law_follows_are_as_likely_as_all_others() -> None:
+    families = [Family(coordinate, {}, "") for coordinate in ("time", "height", "place", "speed", "spin", "swinging")]
+    assert weights_of(families, "linear_drag") == [1, 1, 1, 5, 1, 1]
+    assert weights_of(families, "magnus_lift") == [1, 1, 1, 2, 2, 1]
+    assert weights_of(families, "gravity_tilt") == [1] * 6
+    assert _log_mean([0.0, np.log(3.0)], [1.0, 3.0]) == pytest.approx(np.log(2.5))
+    library = [Candidate(name, load_effect(name)) for name in (*LIBRARY, "length_scale", "clock_scale")]
+    assert _forces(("gravity_scale", "length_scale", "clock_scale"), library) == pytest.approx(1 / 3)
+    assert _forces(("length_scale",), library) == 1  # a scale that sets in is a force all the same
 
 
 def test_a_damping_by_the_square_of_the_spin_is_no_spin_damping() -> None:
