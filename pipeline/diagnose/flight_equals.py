@@ -194,6 +194,7 @@ def _not_ruled_out(
     mean beside whatever else acts: one scale for all is then as wrong in contact as none, and what it gains there is
     true without being all. So it is not ruled out, and rules nothing else out. Nor does a constant force, which is a
     tilt and another gravity together: what its further number gains in contact may be what the contact law misses.
+    Where contact is described no better with the best of them than with none, it tells nothing.
 
     Args:
         equals: The equals.
@@ -206,9 +207,9 @@ def _not_ruled_out(
     apart = {k for k in order if sessions and equals[k].name == SCALE}
     ruling = [k for k in order if k not in apart]
     best = min([k for k in ruling if equals[k].name != FORCE] or ruling or order, key=lambda k: total[k])
-    kept = []
+    kept, tells = [], float(gains[best].sum()) > 0
     for k in order:
-        if k in apart:
+        if k in apart or not tells:
             kept.append(equals[k])
             continue
         worse = gains[best] - gains[k]

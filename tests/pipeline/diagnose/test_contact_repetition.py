@@ -74,7 +74,7 @@ def test_a_scale_of_lengths_neither_rules_out_nor_is_ruled_out_where_sessions_ma
     total: tuple[float, ...], kept: set[str], alone: set[str]
 ) -> None:
     equals = [evidence(name) for name in ("length_scale", "clock_scale", "buoyancy")]
-    gains = [np.full(8, -cost / 8) for cost in total]
+    gains = [np.full(8, (100 - cost) / 8) for cost in total]
     found = [
         _not_ruled_out(equals, gains, np.array(total), linear(np.zeros(8)), sessions) for sessions in (True, False)
     ]
@@ -83,9 +83,13 @@ def test_a_scale_of_lengths_neither_rules_out_nor_is_ruled_out_where_sessions_ma
 
 def test_a_constant_force_rules_no_tilt_out_that_is_a_part_of_it() -> None:
     names, total = ("constant_force", "gravity_tilt", "frame_tilt"), (0.0, 60.0, 200.0)
-    gains = [np.full(8, -cost / 8) for cost in total]
-    found = _not_ruled_out([evidence(name) for name in names], gains, np.array(total), linear(np.zeros(8)), False)
+    gains = [np.full(8, (100 - cost) / 8) for cost in total]
+    equals = [evidence(name) for name in names]
+    found = _not_ruled_out(equals, gains, np.array(total), linear(np.zeros(8)), False)
     assert {one.name for one in found} == {"constant_force", "gravity_tilt"}
+    # where none of them describes contact better than nothing does, none is ruled out
+    worse = [one - 100 for one in gains]
+    assert len(_not_ruled_out(equals, worse, np.array(total), linear(np.zeros(8)), False)) == 3
 
 
 def test_effects_that_do_the_same_are_kept_beside_the_first() -> None:
