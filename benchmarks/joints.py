@@ -138,9 +138,14 @@ def write_tracks(folder: Path, motions: list[list[str]]) -> list[str]:
 
 
 def print_found(model: Path, truth: Mapping[str, float], more: Mapping[str, float]) -> None:
-    """Print what a fit found of parameters whose true values are known, one JSON line each, with more numbers."""
+    """Print what a fit found of parameters whose true values are known, one JSON line each, with more numbers.
+
+    Those that it did not fit are left out.
+    """
     fitted = {p.name: p for p in read_model(model).file.parameters}
     for name, value in truth.items():
+        if name not in fitted:
+            continue
         one = fitted[name]
         row = {
             "parameter": name,

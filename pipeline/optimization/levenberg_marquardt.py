@@ -79,6 +79,7 @@ def minimise(
     prior_information: Tensor | None = None,
     shared_prior: tuple[Tensor, Tensor] | None = None,
     on_iteration: Callable[[int, float], None] | None = None,
+    damp_states: bool = True,
 ) -> Solution:
     """Minimise the robust sum of squares over shared parameters and item states.
 
@@ -93,6 +94,7 @@ def minimise(
         prior_information: Information (S,), or (B, S), of a zero-mean prior on each state change.
         shared_prior: Center (P,) and information (P,) of a prior on the parameters, not part of the result.
         on_iteration: Called with the iteration and the cost.
+        damp_states: Whether the states are damped, too; not where residuals are linear in them.
 
     Raises:
         NotConvergedError: If the residuals at the start are not finite.
@@ -102,7 +104,7 @@ def minimise(
     prior = torch.zeros(states.shape[1]).to(states) if prior_information is None else prior_information
     box = Box.within(bounds, centre, held)
     problem = _SharedAndStates(residuals, robust_scale, prior, box, states.new_zeros(len(states), dtype=torch.long))
-    policy = Policy(iterations=iterations, relative=tolerance)
+    policy = Policy(iterations=iterations, relative=tolerance, damp_states=damp_states)
     report = None if on_iteration is None else lambda step, descent: on_iteration(step, float(descent.cost[0]))
     end = descend(problem, Point(values=shared[None], states=(states,)), policy, report)
     if not bool(end.history[0].isfinite()):

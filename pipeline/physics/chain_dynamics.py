@@ -59,6 +59,20 @@ class Kick:
     """Velocity of each link's origin and its angular velocity by generalised velocity, shape (B, L, 6, nv)."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Balance:
+    """Terms of the equation of motion of a chain: mass v' + bias = the generalised forces on it."""
+
+    mass: Tensor
+    """Mass matrix with reflected inertias, shape (B, nv, nv)."""
+    bias: Tensor
+    """Forces that keep the generalised velocity: Coriolis, centrifugal, and against gravity, shape (B, nv)."""
+    rows: Tensor
+    """Velocity of each link's origin and its angular velocity by generalised velocity, shape (B, L, 6, nv)."""
+    origin: Tensor
+    """Origins of the links, world frame [m], shape (B, L, 3)."""
+
+
 @dataclass(frozen=True)
 class CentralMotion:
     """Motion of a body about its centre of mass, world frame, by which effects push it."""
@@ -197,6 +211,15 @@ class ChainDynamics:
         found = after(0.5 * (speed + first))
         now = _Place.of(self, motion)
         return Kick(found, inverse_root, now.rows())
+
+    def balance(self, motion: ChainMotion, gravity: Tensor) -> Balance:
+        """Return the terms of the equation of motion at a motion; gravity [m/s2] of shape (1 or B, 3)."""
+        place = _Place.of(self, motion)
+        still = motion.speeds.new_zeros(self.base_size)
+        own = torch.cat((still, self.numbers["armature"][0]))
+        mass = place.mass_matrix() + torch.diag(own)
+        origin = place.origin + motion.position[:, None]
+        return Balance(mass=mass, bias=place.bias(motion, gravity, None), rows=place.rows(), origin=origin)
 
     def end(self, motion: ChainMotion, speed: Tensor, step_s: Tensor, ahead: Motion | None) -> ChainMotion:
         """Return the motion at the end of a step, given the generalised velocity there."""

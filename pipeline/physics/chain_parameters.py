@@ -63,6 +63,11 @@ def _losses(world: World, chain: Chain, joint: Joint) -> list[Parameter]:
     ]
 
 
+def mass_factor(chain: Chain) -> Parameter:
+    """Return the factor of the masses and inertias of all moving links, which forces tell and motion alone does not."""
+    return _positive(f"{chain.name}.mass_factor", "1", 1.0, MASS_STD, (0.2, 5.0), "measured forces that accelerate it")
+
+
 def _trace(body: Body) -> Tensor:
     return body.inertia[0].diagonal().sum()
 

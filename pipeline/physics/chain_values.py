@@ -27,7 +27,8 @@ def moving_links(world: World, chain: Chain) -> dict[str, Body]:
 def with_chain_values(world: World, column: Mapping[str, Tensor]) -> World:
     """Return the world with the values (B,) of parameters of its jointed bodies, by name.
 
-    A factor of mass is relative to the links that have none: masses are scaled so that their sum stays.
+    A factor of mass is relative to the links that have none: masses are scaled so that their sum stays, unless the
+    articulation has a factor of its own, of the masses and inertias of all its moving links.
     """
     if not any("." in name for name in column):
         return world
@@ -48,14 +49,16 @@ def _with_losses(joint: Joint, column: Mapping[str, Tensor]) -> Joint:
 def _with_masses(world: World, chain: Chain, column: Mapping[str, Tensor]) -> World:
     links = moving_links(world, chain)
     factors = {name: column[f"{name}.mass_factor"] for name in links if f"{name}.mass_factor" in column}
-    inertia = column.get(f"{chain.name}.inertia_factor")
-    if not factors and inertia is None:
+    inertia, every = column.get(f"{chain.name}.inertia_factor"), column.get(f"{chain.name}.mass_factor")
+    given = [*factors.values(), *(value for value in (inertia, every) if value is not None)]
+    if not given:
         return world
-    like = next(iter([*factors.values(), *([] if inertia is None else [inertia])]))
+    like = given[0]
     one = torch.ones_like(like)
     raw = {name: factors.get(name, one) * body.mass for name, body in links.items()}
     before = torch.stack([body.mass.expand_as(one) for body in links.values()]).sum(0)
     scale = before / torch.stack(list(raw.values())).sum(0) if factors else one
+    scale = scale if every is None else scale * every
     for name, body in links.items():
         mass = raw[name] * scale
         share = mass / body.mass * (one if inertia is None else inertia)

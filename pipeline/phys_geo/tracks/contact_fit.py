@@ -68,6 +68,7 @@ from .contact_result import (
     with_damping,
 )
 from .contact_shooting import ShootingEpisodes, shoot_contact
+from .driven_joints import fit_driven_joints
 from .earlier_estimates import EarlierEstimates
 from .force_fit import with_forces
 from .inertia_fit import MASS_PARTS, fit_mass_distribution
@@ -152,15 +153,22 @@ def _found(
     )
     if data.airborne:
         return _never_touching(ready, batch, data, record, earlier)
-    estimate, record = _contact_estimate(ready, data, batch, config, warm_started, record)
+    driven = fit_driven_joints(ready.world, data.searched, data.noise, force_std_n)
+    known = ready
+    if driven is not None:
+        known = replace(ready, world=driven.world(ready.world), start=driven.narrowed(ready.start))
+    estimate, record = _contact_estimate(known, data, batch, config, warm_started, record)
     if data.bounces is not None:
         estimate = with_damping(estimate, damping_of(data.bounces))
     forces = measured_forces(ready.world, data.searched, batch.observations, force_std_n)
-    if forces:
+    if driven is not None:
+        estimate = driven.put_in(estimate, ready.parameters)
+        record = replace(record, forces=driven.record)
+    elif forces:
         note("phys-geo: measured forces")
         estimate, told = with_forces(ready.world, estimate, forces, batch.observations, batch.start_cov)
         record = replace(record, forces=told)
-    return physics_fit(ready.world, earlier.kept_in(ready.world, estimate), data.noise, record)
+    return physics_fit(known.world, earlier.kept_in(known.world, estimate), data.noise, record)
 
 
 def _require_short_steps(step_s: float) -> None:

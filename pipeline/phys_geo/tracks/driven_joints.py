@@ -1,0 +1,524 @@
+"""Losses in joints and mass of a jointed body from the measured forces that drive it, by its momentum.
+
+A rollout through the contact law turns the path of a driven body into forces, so that shapes, paths and the law of the
+contact, which are known to tenths of a millimetre at best, count as exact; what they cannot follow goes into losses
+that are too sure. Here the measured forces are what drives the links (`force_driven.py`), and the tracks of the links
+are what is fitted: gap, path and law do not enter. Fitted together are
+
+- damping and dry friction of each joint, and one factor of all masses, which motion alone does not tell,
+- how late forces are noted, unknown by half an interval between samples, whether they are samples or means, and the
+  offset of a sensor's zero, known by what it reads apart from all links,
+- of each episode: its start, and an unknown mean force on each of its parts.
+
+All but the first are eliminated from the information. Where tracks differ from the model by more than their noise,
+variances grow by the misfit and by what goes together in neighbouring frames; with many episodes their scatter counts,
+as in `force_fit.py`.
+
+It takes a jointed body on a fixed root, alone in its world, whose links touch nothing but driven bodies with forces.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from torch import Tensor
+
+from ....datasets.capture.tracks import Episode, Track
+from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
+from ...physics.chain_parameters import chain_parameters, mass_factor
+from ...physics.parameters import Parameter
+from ...physics.world import World
+from ...trajectories.initial_state import clearance
+from ...trajectories.observations import Observations
+from ...trajectories.track_noise import Noise, estimate_noise
+from .driven_result import DrivenFit, Pressed
+from .force_driven import LOADED, ForceDriven, Grid, Pushes, Samples, between, hit_errors, impulse_errors, loaded
+from .joint_tracks import JointTracks
+from .measured_forces import force_noise
+from .slip_friction import slip_friction
+
+MOST_FRAMES = 400
+"""Maximum number of frames of an episode, counted from shortly before the first force."""
+BEFORE_S = 0.2
+"""How long before the first force [s]."""
+MOST_PARTS = 60
+"""Number of parts of equal length of an episode with an unknown mean force each; parts end at kicks, too, and where the
+sense changes."""
+APART_M = 0.003
+"""Gap between links and what does not drive them above which they touch nothing else [m]."""
+ZERO_M = 0.005
+"""Gap above which a driven body touches nothing, so that its sensor reads its zero [m]."""
+START = 10.0
+"""Standard deviation of the prior of a start, in errors of the first frames."""
+FIRST_FRAMES = 5
+"""Frames of the straight line that is the first guess of a start."""
+STEPS = (0.03, 0.05)
+"""Steps of the differences: of a parameter, and of the other coordinates in their standard deviations."""
+ROBUST_SCALE = 4.0
+"""Scale of the robust loss of a frame, in standard deviations."""
+MANY_EPISODES = 8
+"""Number of episodes from which on their scatter counts."""
+KICK = 4.0
+"""Variance of an impulse, relative to the usual one, from which on an interval is a part of its own."""
+OPEN = 10.0
+"""Standard deviation of a force of which only the size is known, dry friction where a joint may stand still or a hit
+between samples, in that size: such forces have a sign, and a narrow prior about 0 would draw the other numbers."""
+MOVES = 4.0
+"""Speed, in standard deviations, above which a joint moves; beside what it may lose between frames."""
+ITERATIONS, TOLERANCE = 40, 1e-5
+"""Limit on steps of a descent, and the share of the cost below which a step ends it."""
+NOTED = ((0.0, 1.0, 5.0), (0.5, 0.5, 1.5), (0.0, 1.0, 5.0))
+"""Median, standard deviation and largest size of the delay, in half intervals between samples, of the part of a mean
+that samples are, 0 for samples and 1 for means, and of the offset of the sensor's zero, in its standard deviation."""
+MOST_CORRELATION = 0.98
+"""Largest correlation of neighbouring residuals that is believed."""
+
+
+def fit_driven_joints(
+    world: World, episodes: Sequence[Episode], noise: Noise, force_std_n: float | None
+) -> DrivenFit | None:
+    """Return losses and mass of a jointed body from measured forces; None where these are not all that drives it.
+
+    Args:
+        world: The world.
+        episodes: Name and tracks by body of each episode.
+        noise: Of the tracks (position [m], rotation [rad]).
+        force_std_n: Noise of a component of the forces [N]; estimated where None.
+    """
+    if not _takes(world):
+        return None
+    pushed = [one for one in (_Pushed.of(world, episode, force_std_n) for episode in episodes) if one is not None]
+    data = _Data.of(world, pushed, noise) if pushed else None
+    return None if data is None else _fitted(data)
+
+
+def _takes(world: World) -> bool:
+    """Return whether a world is one jointed body on a fixed root, beside driven bodies and what does not move."""
+    one = len(world.chains) == 1 and world.chains[0].base == "fixed" and not world.chains[0].touching
+    links = set(world.chains[0].links) if one else set()
+    return one and not world.effects and all(world.bodies[k].name in links for k in world.tracked)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pushed:
+    """Part of an episode in which measured forces drive the links."""
+
+    episode: Episode
+    """Its tracks, those of driven bodies of their whole length."""
+    std_n: dict[str, float]
+    """Noise of a component of the forces of each driven body [N]."""
+
+    @staticmethod
+    def of(world: World, episode: Episode, std_n: float | None) -> _Pushed | None:
+        """Cut an episode; None where a driven body has no forces, or none pushes."""
+        names = [body.name for body in world.bodies if body.motion == "driven" and body.name in episode.tracks]
+        driven = {name: episode.tracks[name] for name in names}
+        if not driven or any(track.force_n is None or len(track) < 3 for track in driven.values()):
+            return None
+        noise = {n: std_n or force_noise(t.force_n) for n, t in driven.items() if t.force_n is not None}
+        pushes = [t.time_s[loaded(t, noise[n], t.time_s)] for n, t in driven.items()]
+        if not any(len(times) for times in pushes):
+            return None
+        begins = min(float(times[0]) for times in pushes if len(times)) - BEFORE_S
+        first = max(begins, *(float(track.time_s[0]) for track in driven.values()))
+        last = min(float(track.time_s[-1]) for track in driven.values())
+        links = {n: t for n, t in episode.tracks.items() if n in world.chains[0].links}
+        times = np.unique(np.concatenate([track.time_s for track in links.values()]))
+        times = times[(times >= first) & (times <= last)][:MOST_FRAMES]
+        if len(times) < FIRST_FRAMES:
+            return None
+        cut = {name: track.window(float(times[0]), float(times[-1])) for name, track in links.items()}
+        kept = {name: track for name, track in cut.items() if len(track)}
+        return _Pushed(episode=Episode(episode.name, kept | driven), std_n=noise)
+
+    def from_zero(self, zeros: Mapping[str, NDArray[np.float64]]) -> _Pushed:
+        """Return the part with forces from other zeros (3,) of the sensors [N], by driven body."""
+        tracks = dict(self.episode.tracks)
+        for name, zero in zeros.items():
+            track = self.force(name)
+            if track is not None and track.force_n is not None:
+                tracks[name] = replace(track, force_n=track.force_n - zero)
+        return replace(self, episode=Episode(self.episode.name, tracks))
+
+    def force(self, name: str) -> Track | None:
+        """Return the track of a driven body with forces, if it is in the episode."""
+        return self.episode.tracks.get(name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Data:
+    """Episodes (E) with T frames of J joints, as a least-squares problem."""
+
+    pushed: Sequence[_Pushed]
+    driven: ForceDriven
+    tracks: JointTracks
+    parameters: Sequence[Parameter]
+    """Losses and the factor of mass (P)."""
+    root: Tensor
+    """Symmetric root of the information of the tracks, shape (E, T, J, J)."""
+    start: tuple[Tensor, Tensor, Tensor, Tensor]
+    """First guess of values and speeds, and the standard deviations of their priors, each (E, J)."""
+    part: Tensor
+    """Part of the episode with a force of its own in which each interval is, shape (E, T - 1)."""
+    part_std: Tensor
+    """Standard deviation of that generalised force, shape (E, parts, J)."""
+    late_s: float
+    """Standard deviation of the time by which forces are noted too late [s]."""
+
+    @staticmethod
+    def of(world: World, pushed: Sequence[_Pushed], noise: Noise) -> _Data | None:
+        """Collect them; None where links touch something else, or it is not clear which link is pushed."""
+        seen = Observations.of(world, [one.episode for one in pushed], [(-math.inf, math.inf)] * len(pushed))
+        alone = clearance(world, replace(seen, drives={}))
+        if not bool((alone > APART_M)[seen.seen.amax(-1) > 0].all()):
+            return None
+        chain = world.chains[0]
+        tracks = JointTracks.of(world, chain, seen, noise)
+        grid = Grid.of(tracks.times_s, tracks.shown)
+        names = [body.name for body in world.bodies if body.motion == "driven" and body.name in seen.drives]
+        links = {name: _pushed_link(world, seen, pushed, name) for name in names}
+        if any(link is None for link in links.values()):
+            return None
+        zeros = {name: _zero(world, seen, pushed, name) for name in names}
+        pushed = [one.from_zero({name: zero for name, (zero, _) in zeros.items()}) for one in pushed]
+        pushes = [_push(pushed, name, link, grid, zeros[name][1]) for name, link in links.items() if link is not None]
+        variance = _impulse_variance(world, seen, pushed, tracks, grid, dict(zip(names, pushes, strict=True)))
+        kicks = _kicks(tracks, variance)
+        tracks = tracks.kicked(kicks)
+        sense, size = _senses(tracks, pushes, grid)
+        part, std = _parts(tracks, sense, kicks, variance, size)
+        interval = [float(np.median(np.diff(t.time_s))) for one in pushed for n in names if (t := one.force(n))]
+        losses = [p for p in chain_parameters(world) if p.name.endswith((".damping", ".friction"))]
+        return _Data(
+            pushed=pushed,
+            driven=ForceDriven(world=world, chain=chain, root=tracks.root, grid=grid, pushes=pushes, sense=sense),
+            tracks=tracks,
+            parameters=[*losses, mass_factor(chain)],
+            root=_root(tracks.information),
+            start=_starts(tracks),
+            part=part,
+            part_std=std,
+            late_s=0.5 * float(np.median(interval)),
+        )
+
+    def residuals(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
+        """Return residuals (E, T, J) in sigmas and their derivatives (E, T, J, P + 3 + S); see `minimise`."""
+        point, every = torch.cat((shared.expand(len(states), -1), states), 1), torch.arange(len(states))
+        if not with_jacobian:
+            return self._residuals(point, every), None
+        sizes = [STEPS[0]] * len(self.parameters) + [STEPS[1]] * (point.shape[1] - len(self.parameters))
+        steps = torch.tensor(sizes).to(point)
+        moves = torch.cat((0 * steps[None], torch.diag(steps), -torch.diag(steps)))
+        moved = (point[None] + moves[:, None]).flatten(0, 1)
+        found = self._residuals(moved, every.repeat(len(moves))).unflatten(0, (len(moves), -1))
+        ahead, behind = found[1:].chunk(2)
+        return found[0], ((ahead - behind) / (2 * steps[:, None, None, None])).movedim(0, -1)
+
+    def _residuals(self, point: Tensor, episode: Tensor) -> Tensor:
+        count, joints = len(self.parameters), self.tracks.values.shape[2]
+        column = {p.name: p.decode(point[:, k]) for k, p in enumerate(self.parameters)}
+        state = point[:, count + len(NOTED) :].unflatten(1, (-1, joints))
+        first = [
+            middle[episode] + std[episode] * state[:, k]
+            for k, (middle, std) in enumerate(zip(self.start[:2], self.start[2:], strict=True))
+        ]
+        force = self.part_std[episode] * state[:, 2:]
+        more = force.gather(1, self.part[episode][..., None].expand(-1, -1, joints))
+        late = torch.tensor([self.late_s, 1.0, 1.0]).to(point)
+        noted = late * point[:, count : count + len(NOTED)]
+        moved = self.driven.motion(column, episode, first, more, noted)
+        found = (self.root[episode] @ (moved - self.tracks.values[episode])[..., None])[..., 0]
+        return found.nan_to_num(nan=1e6, posinf=1e6, neginf=-1e6)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates of an episode."""
+        return (2 + self.part_std.shape[1]) * self.part_std.shape[2]
+
+
+def _pushed_link(world: World, seen: Observations, pushed: Sequence[_Pushed], name: str) -> int | None:
+    """Return the place in the chain of the link that a driven body pushes; None where it may be one of several."""
+    chain = world.chains[0]
+    links = {link: chain.links.index(world.bodies[link_index].name) for link, link_index in enumerate(seen.free)}
+    moving = {column: place for column, place in links.items() if chain.moves(chain.links[place])}
+    if len(moving) == 1:
+        return next(iter(moving.values()))
+    near = {place: _gaps(world, seen, name, column) for column, place in moving.items()}
+    touched = np.zeros(seen.times_s.shape, bool)
+    for e, one in enumerate(pushed):
+        track = one.force(name)
+        if track is not None:
+            touched[e] = loaded(track, one.std_n[name], seen.times_s[e].numpy()) & (seen.seen[e].amax(-1) > 0).numpy()
+    ranked = sorted(near, key=lambda place: float(np.median(near[place][touched])))
+    return ranked[0] if float(near[ranked[1]][touched].min()) > APART_M else None
+
+
+def _gaps(world: World, seen: Observations, name: str, column: int | None = None) -> NDArray[np.float64]:
+    """Return the smallest gap (E, T) [m] between a driven body and the links, or the one in a column of these."""
+    alone = replace(seen, drives={name: seen.drives[name]})
+    if column is not None:
+        alone = replace(
+            alone,
+            free=(seen.free[column],),
+            position_m=seen.position_m[:, :, [column]],
+            quat_wxyz=seen.quat_wxyz[:, :, [column]],
+        )
+    bodies = tuple(body for body in world.bodies if body.motion != "fixed")
+    return clearance(replace(world, bodies=bodies, ground_normal=None, surfaces=()), alone).numpy()
+
+
+def _zero(world: World, seen: Observations, pushed: Sequence[_Pushed], name: str) -> tuple[NDArray[np.float64], float]:
+    """Return what a sensor reads apart from all links (3,) [N], and its error: 0 and the noise where it never is."""
+    gaps, read, noise = _gaps(world, seen, name), [np.zeros((0, 3))], 0.0
+    for e, one in enumerate(pushed):
+        track = one.force(name)
+        if track is not None and track.force_n is not None:
+            count, noise = int(seen.frames[e]), max(noise, one.std_n[name])
+            at = np.interp(track.time_s, seen.times_s[e, :count].numpy(), gaps[e, :count], left=0.0, right=0.0)
+            read.append(track.force_n[at > ZERO_M])
+    every = np.concatenate(read)
+    return (np.median(every, 0), 1.25 * noise / len(every) ** 0.5) if len(every) else (np.zeros(3), noise)
+
+
+def _push(pushed: Sequence[_Pushed], name: str, link: int, grid: Grid, zero_std_n: float) -> Pushes:
+    """Return what a driven body exerts in all steps of the episodes; the zero of its sensor has an error [N]."""
+    tracks = [one.force(name) for one in pushed]
+    samples, none = Samples.of(tracks), torch.zeros(*grid.middle_s.shape, 3).to(grid.middle_s)
+    place, torque = none.clone(), none.clone()
+    for e, track in enumerate(tracks):
+        if track is not None:
+            place[e] = between(track.time_s, track.position_m, grid.middle_s[e])
+            torque[e] = (
+                none[e] if track.torque_n_m is None else between(track.time_s, track.torque_n_m, grid.middle_s[e])
+            )
+    every = torch.arange(len(tracks))
+    force = samples.at(every, grid.middle_s, torch.zeros(len(tracks)).to(none))
+    mean = force.mean((0, 1))
+    offset = zero_std_n * mean / mean.norm().clamp_min(1e-12)
+    return Pushes(link=link, samples=samples, force_n=force, place_m=place, torque_n_m=torque, offset_n=offset)
+
+
+def _impulse_variance(
+    world: World,
+    seen: Observations,
+    pushed: Sequence[_Pushed],
+    tracks: JointTracks,
+    grid: Grid,
+    pushes: Mapping[str, Pushes],
+) -> Tensor:
+    """Return the variance (E, T - 1, J) of the mean generalised force on intervals that samples do not tell."""
+    balance, shape = tracks.balance(), tracks.values.shape
+    mass = balance.mass.diagonal(dim1=-2, dim2=-1).unflatten(0, shape[:2])[:, :-1]
+    variance = torch.zeros_like(mass)
+    for name, push in pushes.items():
+        arms = push.arms(balance, tracks, grid)[:, :-1]
+        gaps = _gaps(world, seen, name)
+        for e, one in enumerate(pushed):
+            track, times = one.force(name), tracks.times_s[e].numpy()
+            if track is not None:
+                known = impulse_errors(track, one.std_n[name], times)
+                hits = OPEN * hit_errors(track, one.std_n[name], times, gaps[e])
+                variance[e] += (torch.as_tensor(known)[:, None, None] * arms[e]).square().sum(1)
+                moved = torch.einsum("kcj,c->kj", arms[e], push.direction(e)).abs().clamp_min(1e-6)
+                variance[e] += (mass[e] * torch.as_tensor(hits)[:, None] / moved).square()
+    return variance
+
+
+def _kicks(tracks: JointTracks, variance: Tensor) -> Tensor:
+    """Return the intervals (E, T - 1) whose impulse samples tell much worse than that of most."""
+    seen = tracks.shown[:, 1:, None].expand_as(variance)
+    usual = torch.stack([variance[..., j][seen[..., j]].median() for j in range(variance.shape[2])])
+    return ((variance > KICK * usual) & seen).any(-1)
+
+
+def _senses(tracks: JointTracks, pushes: Sequence[Pushes], grid: Grid) -> tuple[Tensor, Tensor]:
+    """Return the sense (E, T - 1, J) in which joints move on intervals, 0 where one may stand, and what drives them.
+
+    The latter is the root of the mean square (J,) of the generalised force. A joint moves for sure where it is faster
+    than the errors of its speed and than what such a force takes from it in an interval.
+    """
+    balance, shape = tracks.balance(), tracks.values.shape
+    total = sum((push.at_frames(balance, tracks, grid) for push in pushes), torch.zeros(shape).to(tracks.values))
+    acts = tracks.shown[..., None] & (total != 0)
+    size = ((total * acts).square().sum((0, 1)) / acts.sum((0, 1)).clamp_min(1)).sqrt().clamp_min(1e-9)
+    mass = balance.mass.diagonal(dim1=-2, dim2=-1).unflatten(0, shape[:2])
+    lost = (size / mass)[:, :-1] * tracks.times_s.diff(dim=1)[..., None]
+    fast = tracks.speeds.abs() - MOVES * tracks.speed_std
+    both = torch.minimum(fast[:, 1:], fast[:, :-1]) > lost
+    sense = tracks.speeds.sign()
+    same = (sense[:, 1:] == sense[:, :-1]) & tracks.shown[:, 1:, None]
+    return torch.where(both & same, sense[:, :-1], torch.zeros_like(lost)), size
+
+
+def _parts(tracks: JointTracks, sense: Tensor, kicks: Tensor, variance: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the part (E, T - 1) of each interval, and the standard deviation (E, parts, J) of its mean force.
+
+    Args:
+        tracks: The joints.
+        sense: Sense in which they move, shape (E, T - 1, J).
+        kicks: Intervals that are parts of their own, shape (E, T - 1).
+        variance: Variance of the mean generalised force on each interval, shape (E, T - 1, J).
+        size: Size of the friction of a joint that may stand still, which lasts, shape (J,).
+    """
+    each = max(1, -(-sense.shape[1] // MOST_PARTS))
+    new = torch.zeros_like(sense[..., 0], dtype=torch.bool)
+    since = torch.zeros(len(sense), dtype=torch.long)
+    for k in range(1, sense.shape[1]):
+        since = since + 1
+        new[:, k] = (since >= each) | (sense[:, k] != sense[:, k - 1]).any(-1) | kicks[:, k] | kicks[:, k - 1]
+        since = torch.where(new[:, k], torch.zeros_like(since), since)
+    part = new.to(torch.long).cumsum(1)
+    length = (tracks.times_s.diff(dim=1) * tracks.shown[:, 1:])[..., None]
+    place = part[..., None].expand_as(sense)
+    none = sense.new_zeros(len(sense), int(part.max()) + 1, sense.shape[2])
+    impulse = none.scatter_add(1, place, variance * length.square()).sqrt()
+    whole = none.scatter_add(1, place, length.expand_as(sense))
+    stands = none.scatter_add(1, place, (sense == 0) * length)
+    std = torch.hypot(impulse / whole.clamp_min(1e-9), OPEN * size * stands / whole.clamp_min(1e-9))
+    return part, torch.where(whole > 0, std, none).clamp_min(1e-9)
+
+
+def _starts(tracks: JointTracks) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return first guesses of values and speeds, and the standard deviations of their priors, each (E, J)."""
+    t = (tracks.times_s - tracks.times_s[:, :1])[:, :FIRST_FRAMES, None]
+    first = tracks.values[:, :FIRST_FRAMES]
+    middle, mean = t.mean(1, keepdim=True), first.mean(1, keepdim=True)
+    spread = (t - middle).square().sum(1)
+    speed = ((t - middle) * (first - mean)).sum(1) / spread
+    known = tracks.information[:, :FIRST_FRAMES].diagonal(dim1=-2, dim2=-1).amax(1)
+    error = START * known.clamp_min(1e-12).rsqrt()
+    return mean[:, 0] - speed * middle[:, 0], speed, error, error / spread.sqrt()
+
+
+def _root(information: Tensor) -> Tensor:
+    """Return the symmetric roots of informations (..., J, J)."""
+    values, axes = torch.linalg.eigh(information)
+    return (axes * values.clamp_min(0.0).sqrt()[..., None, :]) @ axes.transpose(-1, -2)
+
+
+def _first_losses(data: _Data) -> NDArray[np.float64]:
+    """Return a first guess of the parameters (P,): losses by the change of momentum between frames that move."""
+    tracks, driven = data.tracks, data.driven
+    balance, shape = tracks.balance(), tracks.values.shape
+    total = sum((p.at_frames(balance, tracks, driven.grid) for p in driven.pushes), torch.zeros_like(tracks.values))
+    total = total - balance.bias.unflatten(0, shape[:2])
+    mass = balance.mass.unflatten(0, shape[:2])[:, 1:]
+    length = tracks.times_s.diff(dim=1)[..., None]
+    change = (mass @ (tracks.speeds.diff(dim=1) / length)[..., None])[..., 0]
+    lost = 0.5 * (total[:, 1:] + total[:, :-1]) - change
+    speed = 0.5 * (tracks.speeds[:, 1:] + tracks.speeds[:, :-1])
+    found = np.array([p.encode(p.prior[0]) for p in data.parameters])
+    for j, name in enumerate(driven.chain.joint_names):
+        moves = (driven.sense[..., j] != 0) & lost[..., j].isfinite()
+        if not bool(moves.any()):
+            continue
+        rows = torch.stack((speed[..., j][moves], driven.sense[..., j][moves]), 1)
+        for number, value in zip(
+            ("damping", "friction"), nnls(rows.numpy(), lost[..., j][moves].numpy())[0], strict=True
+        ):
+            k = [p.name for p in data.parameters].index(f"{name}.{number}")
+            if value > 0:  # else the prior's median: the logarithm of a loss that is far too small has no slope
+                found[k] = np.clip(data.parameters[k].encode(float(value)), *data.parameters[k].limits)
+    return found
+
+
+def _pressed(data: _Data) -> list[Pressed]:
+    """Return what forces tell of each driven body and the link that it pushes."""
+    found, tracks, pushed = [], data.tracks, data.pushed
+    balance, names = tracks.balance(), tracks.world.body_names
+    driven = [name for name in names if any(name in one.std_n for one in pushed)]
+    for name, push in zip(driven, data.driven.pushes, strict=True):
+        seen = [(e, t, one.std_n[name]) for e, one in enumerate(pushed) if (t := one.force(name)) is not None]
+        arms = push.arms(balance, tracks, data.driven.grid).flatten(0, 1)
+        along = torch.stack([push.direction(e) for e in range(len(pushed))]).repeat_interleave(
+            tracks.values.shape[1], 0
+        )
+        row = torch.einsum("kcj,kc->kj", arms, along)
+        lightness = torch.einsum("ki,kij,kj->k", row, torch.linalg.inv(balance.mass), row)
+        size = push.at_force(data.driven.grid, tracks).flatten()
+        acts = size > LOADED * float(np.median([std for _, _, std in seen]))
+        rate = float((size * lightness)[acts].median()) if bool(acts.any()) else 0.0
+        path = float(np.median([estimate_noise([track]).position_m for _, track, _ in seen]))
+        pair = tracks.world.materials_of(names.index(tracks.chain.links[push.link]), names.index(name))
+        friction = slip_friction(tracks, name, push.link, seen)
+        found.append(Pressed(pair=pair, friction=friction, rate_m_s2=rate, path_std_m=path))
+    return found
+
+
+def _fitted(data: _Data) -> DrivenFit:
+    """Return the estimate with its covariance."""
+    noted = [((-most, most), middle, std) for middle, std, most in NOTED]
+    every = [(p.limits, p.encode(p.prior[0]), p.prior[1]) for p in data.parameters] + noted
+    bounds = torch.tensor([limits for limits, _, _ in every], dtype=torch.float64)
+    centre, known = torch.tensor([(middle, std**-2) for _, middle, std in every], dtype=torch.float64).T
+    point = torch.cat((torch.as_tensor(_first_losses(data)), centre[len(data.parameters) :]))
+    states, best = torch.zeros(len(data.part), data.size).to(centre), None
+    for scale in (None, ROBUST_SCALE):  # far from the tracks a robust loss has no slope
+        best = minimise(
+            data.residuals,
+            point,
+            states,
+            bounds,
+            robust_scale=scale,
+            iterations=ITERATIONS,
+            tolerance=TOLERANCE,
+            damp_states=False,  # forces on many parts take each other's place: damped steps would be short
+            prior_information=torch.ones(data.size).to(centre),
+            shared_prior=(centre, known),
+        )
+        point, states = best.shared, best.states
+    assert best is not None
+    covariance, record = _covariance(data, best, known)
+    count = len(data.parameters)
+    record |= {
+        "episodes": len(data.part),
+        "frames": int(data.tracks.shown.sum()),
+        "moving": float((data.driven.sense != 0).to(centre).mean()),
+        "late_s": float(best.shared[count]) * data.late_s,
+        "cost": best.cost,
+        "converged": best.converged,
+        "used": True,
+        "described": True,
+        "apart": [],
+    }
+    return DrivenFit(
+        parameters=data.parameters,
+        values=best.shared[:count].numpy(),
+        covariance=covariance[:count, :count],
+        pressed=_pressed(data),
+        record=record,
+    )
+
+
+def _covariance(data: _Data, end: Solution, known: Tensor) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Return the covariance (P + 3, P + 3) of the parameters, and how far data and model differ.
+
+    The misfit is that of the residuals by their degrees of freedom. A state whose variance is a share v of its prior's
+    takes 1 - v of one.
+    """
+    seen = data.tracks.shown
+    found, _ = data.residuals(end.shared, end.states, False)
+    cost = robust_loss(found.square().sum(-1), ROBUST_SCALE)[0].sum()
+    absorbed = end.states.numel() - float(end.state_cov.diagonal(dim1=-2, dim2=-1).sum())
+    free = int(seen.sum()) * found.shape[-1] - len(end.shared) - absorbed
+    misfit = float(cost) / max(free, 1.0)
+    pairs = seen[:, 1:] & seen[:, :-1]
+    ahead = float((found[:, 1:] * found[:, :-1])[pairs].sum())
+    correlation = min(max(ahead / max(float(found.square()[seen].sum()), 1e-30), 0.0), MOST_CORRELATION)
+    grown = max(1.0, misfit * (1 + correlation) / (1 - correlation))
+    prior = np.diag(known.numpy())
+    covariance = np.linalg.inv(end.information.numpy() / grown + prior)
+    slopes = end.scores.numpy() / grown
+    if len(slopes) >= MANY_EPISODES:
+        slopes = slopes - slopes.mean(0)
+        scatter = covariance @ (len(slopes) / (len(slopes) - 1) * slopes.T @ slopes + prior) @ covariance
+        wider = np.sqrt(np.maximum(1.0, np.diag(scatter) / np.diag(covariance)))
+        covariance = covariance * np.outer(wider, wider)
+    return covariance, {"misfit": misfit, "correlation": correlation, "information_over": grown}
