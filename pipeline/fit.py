@@ -356,6 +356,7 @@ def _from_scene(capture: Capture, scene: SgGsResult) -> Model:
             for p in _mass_parameters(body, fitted)
         ),
         ground_shadow=scene.ground_shadow,
+        first_view=scene.first_view,
         warnings=tuple(warnings),
         provenance=Provenance(capture=capture.root.name),
     )

@@ -157,6 +157,7 @@ from .model import (
     PairContact,
     Provenance,
     Solver,
+    Viewpoint,
 )
 from .mystery import SEALED_FORMAT, HiddenEffect, MysteryResult, Outcome, SealedFile
 from .plan import Distribution, RejectionRules, SamplingPlan, plan_toml, read_plan
@@ -332,6 +333,7 @@ __all__ = [
     "ValidationReport",
     "Video",
     "ViewReport",
+    "Viewpoint",
     "World",
     "WorldDemoResult",
     "WorstMoment",

@@ -247,6 +247,21 @@ class GroundShadow(FileModel):
         return unit_vector(value, "the direction to the lamp")
 
 
+class Viewpoint(FileModel):
+    """A place to look from, world frame."""
+
+    eye_m: Vector3
+    target_m: Vector3
+    """What is in the middle of the picture."""
+    up: Vector3
+    """Unit vector that points up in the picture."""
+
+    @field_validator("up")
+    @classmethod
+    def _unit(cls, value: Vector3) -> Vector3:
+        return unit_vector(value, "the direction up")
+
+
 class Provenance(FileModel):
     """Where the model comes from."""
 
@@ -293,6 +308,8 @@ class ModelFile(FileModel):
     """Where the videos tell it; None leaves a body in the light of the photos, however it turns."""
     ground_shadow: GroundShadow | None = None
     """As found in the photos; None where none stands out."""
+    first_view: Viewpoint | None = None
+    """That of the photo in the middle of all; None without photos."""
     warnings: tuple[str, ...] = ()
     provenance: Provenance
 

@@ -10,7 +10,7 @@ from ...datasets.capture.cameras import posed
 from ...datasets.capture.capture import Capture
 from ...datasets.io.progress import note
 from ...datasets.shapes.ply import Splats
-from ...schemas import CamerasFile, GroundShadow, InputDataError, SplatConfig, UsageError
+from ...schemas import CamerasFile, GroundShadow, InputDataError, SplatConfig, UsageError, Viewpoint
 from ..geometry.spheres import Spheres
 from ..rendering.contact_sheets import SHEET_BYTES, separated, small_png
 from ..runtime.checkpoint import Checkpoint
@@ -23,7 +23,7 @@ from .context import Stage
 from .held_out import HeldOut, look
 from .link_bodies import link_results
 from .turntable import turntable, upward
-from .views import COVERED, as_bytes, load_views
+from .views import COVERED, as_bytes, load_views, middle_view
 
 _MIN_PHOTOS = 3
 _UNEVEN_DB = 1.0
@@ -42,6 +42,8 @@ class SgGsResult:
     """Collision radius in units of the Gaussian scale."""
     ground_shadow: GroundShadow | None = None
     """The shadow that bodies cast in the photos, or None if none was found."""
+    first_view: Viewpoint | None = None
+    """The photo in the middle of all; None without photos."""
     record: dict[str, Any]
     """Losses, timings and held-out figures, for fit.json."""
     warnings: tuple[str, ...] = ()
@@ -96,6 +98,7 @@ def fit_scene(capture: Capture, config: SplatConfig | None = None, checkpoint: C
         scene=None if scene is None else scene.to_numpy(),
         radius_factor=config.radius_factor,
         ground_shadow=shadow,
+        first_view=middle_view(stage.train) if stage.train else None,
         record=stage.record,
         warnings=tuple(stage.warnings),
         pictures=pictures,

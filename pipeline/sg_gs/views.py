@@ -15,7 +15,7 @@ from ...datasets.capture.cameras import Camera
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.geometry_maps import GeometryMaps
 from ...datasets.io.progress import progress
-from ...schemas import InputDataError
+from ...schemas import InputDataError, Viewpoint
 from ..geometry.solid_grid import Array
 from ..geometry.spheres import Spheres
 from ..rendering.render import RenderOutput, render
@@ -186,6 +186,17 @@ def focus_of(views: Sequence[View]) -> Array:
     across = np.eye(3) - np.einsum("ni,nj->nij", axes, axes)
     centers = np.stack([view.camera.center for view in views])
     return np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]
+
+
+def middle_view(views: Sequence[View]) -> Viewpoint:
+    """Return the place of the photo that is nearest to all others; its target is as far as the point all look at."""
+    centers = np.stack([view.camera.center for view in views])
+    apart = np.linalg.norm(centers[:, None] - centers, axis=2).sum(1)
+    pose = views[int(apart.argmin())].camera.T_world_cam
+    eye, forward = pose[:3, 3], pose[:3, 2]
+    depth = float((focus_of(views) - eye) @ forward)
+    target = eye + (depth if depth > 0 else 1.0) * forward
+    return Viewpoint(eye_m=tuple(eye.tolist()), target_m=tuple(target.tolist()), up=tuple((-pose[:3, 1]).tolist()))
 
 
 def spread_of(views: Sequence[View]) -> float:

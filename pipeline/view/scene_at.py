@@ -128,10 +128,16 @@ def viewpoint(model: Model, motion: Motion, size_m: float) -> tuple[Array, Array
     """Return the initial eye point [m], target [m] and up direction, each (3,), world frame.
 
     The eye point is between the cameras and slightly farther away than they are, or, without cameras, above the motion.
+    What does not move is seen as in the photo in the middle of all: other sides may be in no photo.
     """
+    first = model.file.first_view
+    if first is not None and len(motion.times_s) == 1 and not motion.cameras:
+        return np.array(first.eye_m), np.array(first.target_m), np.array(first.up)
     up = up_direction(model.file)
     moving = [k for k, body in enumerate(model.file.bodies) if body.name in model.file.tracked] or slice(None)
     paths = motion.position_m[:, moving].reshape(-1, 3)
+    if not len(paths):
+        paths = np.zeros((1, 3)) if model.scene is None else np.median(model.scene.means, 0, keepdims=True)
     target = 0.5 * (paths.min(0) + paths.max(0))
     if motion.cameras:
         middle = np.mean([camera.center for camera in motion.cameras.values()], axis=0)

@@ -236,7 +236,8 @@ class Viewer:
             places.on_click(lambda event: self._guarded(lambda: self._look_from(event.client, places.value)))
             seen = any(handle is not None for handle in self._splats)
             self._contacts = gui.add_checkbox("contacts", True)
-            self._looks = gui.add_checkbox("splats", seen, disabled=not seen and self._background is None)
+            looks = seen or not self._shapes  # without bodies, the background is all that there is
+            self._looks = gui.add_checkbox("splats", looks, disabled=not seen and self._background is None)
             self._through = gui.add_checkbox("see-through bodies", False, disabled=not seen)
             self._colliding = gui.add_checkbox("collision spheres", not seen)
             self._axes = gui.add_checkbox("body frames", False)

@@ -17,7 +17,7 @@ from cgwm.pipeline.sg_gs.initialization import _neighbour_scales, points_of_dept
 from cgwm.pipeline.sg_gs.losses import geometry_loss, normals_of, scene_loss
 from cgwm.pipeline.sg_gs.optimize import Rates, Trainable, descend
 from cgwm.pipeline.sg_gs.photo_exposure import Exposures
-from cgwm.pipeline.sg_gs.views import View, _seen, load_views, render_view, spread_of
+from cgwm.pipeline.sg_gs.views import View, _seen, focus_of, load_views, middle_view, render_view, spread_of
 from cgwm.pipeline.sg_gs.visual_hull import Silhouette, carve
 from pipeline.sg_gs.test_sg_gs import PLACE, make_capture, world
 
@@ -152,6 +152,20 @@ def test_held_out_photos_are_corrected_by_their_left_half_alone(views, truth):
     assert figures["psnr_right_half_db"] < 25
     assert figures["psnr_right_half_corrected_db"] > 60
     assert other["psnr_right_half_corrected_db"] < 15
+
+
+def test_the_first_view_is_that_of_the_photo_in_the_middle(views):
+    near = views[:5]
+    seen = middle_view(near)
+    apart = [sum(np.linalg.norm(one.camera.center - other.camera.center) for other in near) for one in near]
+    view = near[int(np.argmin(apart))]
+    np.testing.assert_allclose(seen.eye_m, view.camera.center)
+    pixel, depth = view.camera.project(np.array([seen.target_m]))
+    np.testing.assert_allclose(pixel[0], view.camera.K[:2, 2], atol=1e-6)
+    nearest = np.linalg.norm(np.array(seen.target_m) - focus_of(near))
+    assert depth[0] > 0 and nearest < 0.2 * depth[0]
+    level = view.camera.T_world_cam[:3, 0]
+    assert abs(np.dot(seen.up, level)) < 1e-9 and np.dot(seen.up, view.camera.T_world_cam[:3, 1]) < 0
 
 
 def test_a_held_out_photo_finds_its_pose(small, truth):

@@ -28,7 +28,7 @@ from cgwm.pipeline.view.door import Door
 from cgwm.pipeline.view.motions import can_move, own_motion, recorded_motion, still
 from cgwm.pipeline.view.scene_at import LONGEST_ARROW, background_from, radius_m, scene_at, shapes_of, viewpoint
 from cgwm.pipeline.view.viewer import FIELD_OF_VIEW_RAD
-from cgwm.schemas import Light, SamplingPlan, Surface, SynthesizeConfig, UsageError
+from cgwm.schemas import Light, SamplingPlan, Surface, SynthesizeConfig, UsageError, Viewpoint
 from helpers.browser import Page, chromium
 from helpers.forked import Forked
 from helpers.small_model import HALF, small_model, write_small_model
@@ -146,6 +146,20 @@ def test_the_first_look_is_at_the_body(dataset: Path) -> None:
         np.testing.assert_array_equal(up, [0, 0, 1])
         assert np.linalg.norm(target - one.position_m[:, 0].mean(0)) < 0.3
         assert eye[2] > target[2] and np.linalg.norm(eye - target) > 0.2
+
+
+@needs_viser
+def test_photos_without_bodies_are_seen_as_in_the_middle_one(tmp_path: Path) -> None:
+    seen = Viewpoint(eye_m=(1, 2, 3), target_m=(1, 5, 3), up=(0, 0.6, 0.8))
+    model = small_model()
+    file = model.file.model_copy(update={"bodies": (), "contact": None, "parameters": (), "first_view": seen})
+    write_model(tmp_path / "model", replace(model, file=file, body_splats={}, collision={}))
+    with open_view(tmp_path / "model", port=0) as viewer:
+        for found, wanted in zip(viewer._view, (seen.eye_m, seen.target_m, seen.up), strict=True):
+            np.testing.assert_array_equal(found, wanted)
+        assert viewer._looks.value and viewer._background is not None
+    older = replace(model, file=file.model_copy(update={"first_view": None}), body_splats={}, collision={})
+    assert np.isfinite(viewpoint(older, still(older), 0.1)).all()
 
 
 # What is refused
