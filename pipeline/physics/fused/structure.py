@@ -213,7 +213,7 @@ class Structure:
         shown = max(12 * (links + free), (28 + (self.law_count > 1)) * self.lanes)
         collide = 6 * tree.columns + shown + 11 * self.lanes + 8 + 2 * pairs
         marks = 2 * pairs + 4 * (bodies + links + free + 4 * self.lanes) + 16
-        lasting = 40 + 5 * self.law_count + 41 * bodies + 23 * free + 3 * links + 8 * joints + dofs * (2 + tree.depth)
+        lasting = 40 + 5 * self.law_count + 41 * bodies + 23 * free + 3 * links + 10 * joints + dofs * (2 + tree.depth)
         flags = links + 2 * joints + 4 * roots + 4 * bodies + 128
         if self.gathered:
             numbers, lasts, more = self._gathered_bytes(links + free)

@@ -111,13 +111,14 @@ class Tree:
     def _rows(self) -> dict[str, tuple[str, list[list[int]]]]:
         """Return rows of numbers by the name of the list of their starts, each with the name of the list of them all.
 
-        Links by level, children of each link from the last to the first, coordinates by the number of those above,
+        Links by level, heavy children of each link from last to first, coordinates by the number of those above them,
         coordinates below each one, moving joints by branch, each link once for each coordinate that moves it, and links
         by these coordinates.
         """
         links, dofs = range(len(self.bodies)), range(len(self.dof_links))
         levels = [[k for k in links if self._level(k) == level] for level in range(self.levels)]
-        children = [[k for k in reversed(links) if self.parents[k] == link] for link in links]
+        heavy = [k for k in reversed(links) if not self.light[k]]
+        children = [[k for k in heavy if self.parents[k] == link] for link in links]
         ranks = [[k for k in dofs if len(self.dof_above[k]) == rank + 1] for rank in range(self.depth)]
         below = [[k for k in dofs if k != dof and dof in self.dof_above[k]] for dof in dofs]
         return {

@@ -180,6 +180,7 @@ struct Chain {
     Real speed[DOFS], inverse[DOFS * DEPTH];  // without contact; rows of the inverse of L, A = L^T L
     Real moved[DOFS];                         // what impulses change, mass-weighted
     Real lower[JOINTS + 1], upper[JOINTS + 1], most[JOINTS + 1];  // speeds of the limits, impulse of dry friction
+    Real mobility[JOINTS + 1], masses[JOINTS + 1];                // of the joints that may have impulses
     Vec axes[LINKS];
 #if SHARED
     Real free_masses[FREES];  // inverse, and of inertia in world axes

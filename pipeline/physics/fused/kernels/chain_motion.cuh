@@ -7,7 +7,7 @@ INLINE Vec rotated(Quat q, Vec v) {
 }
 
 // Poses of the links of all chains from those of the roots and the joints' values.
-INLINE void place_links(const Chain& chain, const Lanes& lanes, const Real* values, Vec* positions, Quat* quats) {
+CALLED void place_links(const Chain& chain, const Lanes& lanes, const Real* values, Vec* positions, Quat* quats) {
     MOVED_LINKS(lanes, l) {  // each in its parent's frame
         int kind = link_kind[l];
         if (link_parent[l] < 0) continue;
@@ -27,7 +27,7 @@ INLINE void place_links(const Chain& chain, const Lanes& lanes, const Real* valu
 }
 
 // Velocities of the links from those of the roots and the joints' speeds.
-INLINE void move_links(const Lanes& lanes, const Vec* axes, const Vec* positions, const Real* speeds, Vec* linear,
+CALLED void move_links(const Lanes& lanes, const Vec* axes, const Vec* positions, const Real* speeds, Vec* linear,
                        Vec* angular) {
     DOWN_LINKS(lanes, l) {
         int parent = link_parent[l], kind = link_kind[l];
@@ -50,7 +50,7 @@ INLINE Spatial column_of(const Configuration& at, int dof) {
     return k < 3 ? linear : angular;
 }
 
-INLINE void configure(const Chain& chain, const Lanes& lanes, const Vec* positions, const Quat* quats,
+CALLED void configure(const Chain& chain, const Lanes& lanes, const Vec* positions, const Quat* quats,
                       Configuration& at) {
     MOVED_LINKS(lanes, l) {
         const Joint j = chain.joints[l];
@@ -78,7 +78,7 @@ INLINE Spatial momentum(const Configuration& at, int l, const Spatial& motion) {
 
 // Adds the mass matrix to A, by composite bodies: mass, first moment and inertia of each link and all that it carries,
 // about the root's origin.
-INLINE void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, Real* A) {
+CALLED void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, Real* A) {
     ROOM(Real, mass, LINKS, chain.room.kick.mass);
     ROOM(Vec, moment, LINKS, chain.room.kick.mass);
     ROOM(Sym, inertia, LINKS, chain.room.kick.mass);
@@ -100,7 +100,6 @@ INLINE void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, 
         Sym& to = inertia[parent];
         INNER for (int i = child_start[parent]; i < child_start[parent + 1]; i++) {
             int l = link_child[i];
-            if (link_light[l]) continue;
             mass[parent] += mass[l];
             moment[parent] = moment[parent] + moment[l];
             Sym from = inertia[l];
@@ -139,7 +138,7 @@ INLINE Spatial pushed(const Wrenches& w, const Configuration& at, int l, const S
 
 // Forces that keep the generalised velocity: Coriolis, centrifugal, against gravity, and against effects; recursive
 // Newton-Euler.
-INLINE void bias_of(Environment& env, const Lanes& lanes, const Configuration& at, const Vec* root_linear,
+CALLED void bias_of(Environment& env, const Lanes& lanes, const Configuration& at, const Vec* root_linear,
                     const Vec* root_angular, const Vec* root_lift, const Vec* root_twist, const Real* speed, Real* bias) {
     Chain& chain = env.chain;
     ROOM(Spatial, velocity, LINKS, chain.room.kick.force);
@@ -189,7 +188,6 @@ INLINE void bias_of(Environment& env, const Lanes& lanes, const Configuration& a
         if (link_light[l] || l < FIRST_MOVED) continue;
         Spatial& all = force_on[l];
         INNER for (int i = child_start[l]; i < child_start[l + 1]; i++) {
-            if (link_light[link_child[i]]) continue;
             const Spatial& carried = force_on[link_child[i]];
             all.turning = all.turning + carried.turning;
             all.moving = all.moving + carried.moving;
@@ -207,7 +205,7 @@ INLINE void bias_of(Environment& env, const Lanes& lanes, const Configuration& a
 // Replaces A, given by rows of each coordinate and those above it, by the rows of the inverse of L, A = L^T L; L has the
 // pattern of A (Featherstone, "Efficient factorization of the joint-space inertia matrix for branched kinematic trees",
 // 2005).
-INLINE void factor(const Lanes& lanes, Real* A) {
+CALLED void factor(const Lanes& lanes, Real* A) {
     UP_DOFS(lanes, d) {
         int last = dof_depth[d] - 1;
         Real* row = A + d * DEPTH;
@@ -231,7 +229,7 @@ INLINE void factor(const Lanes& lanes, Real* A) {
 }
 
 // x = inverse(A) b
-INLINE void solve_mass(Chain& chain, const Lanes& lanes, const Real* b, Real* x) {
+CALLED void solve_mass(Chain& chain, const Lanes& lanes, const Real* b, Real* x) {
     const Real* inverse = chain.inverse;
     ROOM(Real, y, DOFS, chain.room.kick);
     DIVIDED(lanes, d, DOFS) {
@@ -291,7 +289,7 @@ INLINE void carry(const Chain& chain, int l, Vec linear, Vec angular, Motion& mo
 
 // Generalised velocity of the chains after the forces of a step, without contact, and the roots of A; then the
 // velocities of the links at their poses of the start.
-INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after, const Mat* rotations,
+CALLED void kick(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after, const Mat* rotations,
                  Motion* motions) {
     Chain& chain = env.chain;
     Real h = env.laws[0].step_s, half_h = Number(0.5) * h;
@@ -438,6 +436,11 @@ INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, R
         if (warm || plain(s.friction) > Number(0) || plain(chain.lower[j]) > Number(-1e29) ||
             plain(chain.upper[j]) > Number(-1e29)) {
             chain.busy[j] = chain.active = true;
+            const Real* row = chain.inverse + joint_dof[j] * DEPTH;
+            Real mobility = Real(0);
+            EACH_ABOVE(k, dof_depth[joint_dof[j]]) mobility += row[k] * row[k];
+            chain.mobility[j] = mobility;
+            chain.masses[j] = reciprocal(mobility);
         }
     }
     lanes.sync();
@@ -464,7 +467,7 @@ INLINE Real joint_impulse(const Chain& chain, int j) {
 
 #if SHARED
 // Makes the columns of all links that contact may move, at the pose of the start of the step.
-INLINE void reveal_links(Chain& chain, const Lanes& lanes, const Body* bodies) {
+CALLED void reveal_links(Chain& chain, const Lanes& lanes, const Body* bodies) {
     DIVIDED(lanes, column, COLUMNS) {
         const int l = column_link[column], k = column - column_start[l], depth = link_depth[l];
         if (!chain.known[l]) continue;
@@ -490,7 +493,7 @@ INLINE Real dof_impulse(const Chain& chain, int d) {
 
 // Mass-weighted motion of the chains under the impulses of their joints and on their links; each coordinate is summed
 // up by one lane.
-INLINE void push_chains(Chain& chain, const Lanes& lanes) {
+CALLED void push_chains(Chain& chain, const Lanes& lanes) {
     const CollideRoom& room = chain.room.collide;
     DIVIDED(lanes, d, DOFS) {
         const int last = dof_depth[d] - 1;
@@ -500,9 +503,15 @@ INLINE void push_chains(Chain& chain, const Lanes& lanes) {
                 sum += chain.inverse[dof_below[i] * DEPTH + last] * dof_impulse(chain, dof_below[i]);
             }
         }
+#if GATHERED  // few links are touched, and many moved
+        INNER for (int r = 0; r < room.reached_count; r++) {
+            const int l = room.reached[r];
+            if (l >= LINKS || link_depth[l] <= last || link_above[l * DEPTH + last] != d) continue;
+#else
         INNER for (int i = moved_start[d]; i < moved_start[d + 1]; i++) {
             const int l = moved_link[i];
             if (!chain.known[l]) continue;
+#endif
             const Column& column = room.columns[column_start[l] + last];
             sum += dot(column.linear, room.pushes[l]) + dot(column.turning, room.moments[l]);
         }
@@ -562,17 +571,13 @@ INLINE void push_joints(Chain& chain) {
 #endif
 
 // One pass over the limits and the dry friction of the joints, one after another in each branch.
-INLINE void sweep_joints(Chain& chain, const Lanes& lanes) {
+CALLED void sweep_joints(Chain& chain, const Lanes& lanes) {
     BRANCHES(lanes, j) {
         if (!chain.busy[j]) continue;
         int d = joint_dof[j], depth = dof_depth[d];
         const Real* row = chain.inverse + d * DEPTH;
-        Real speed = chain.speed[d], mobility = Real(0);
-        EACH_ABOVE(k, depth) {
-            speed += row[k] * chain.moved[dof_above[d * DEPTH + k]];
-            mobility += row[k] * row[k];
-        }
-        Real mass = reciprocal(mobility), *old = chain.impulses + 3 * j;
+        Real speed = chain.speed[d], mobility = chain.mobility[j], mass = chain.masses[j], *old = chain.impulses + 3 * j;
+        EACH_ABOVE(k, depth) speed += row[k] * chain.moved[dof_above[d * DEPTH + k]];
         Real below = at_least(old[0] + mass * (chain.lower[j] - speed), Number(0));
         speed += (below - old[0]) * mobility;
         Real above = at_least(old[1] + mass * (chain.upper[j] + speed), Number(0));
@@ -603,7 +608,7 @@ INLINE void gain(const Chain& chain, int l, Vec& linear, Vec& angular) {
 }
 
 // Moves the links to where the roots and the joints put them, with their velocities.
-INLINE void spread(Environment& env, const Lanes& lanes) {
+CALLED void spread(Environment& env, const Lanes& lanes) {
     Chain& chain = env.chain;
     ROOM(Vec, positions, LINKS, chain.room.settle.place);
     ROOM(Vec, linear, LINKS, chain.room.settle.place);
@@ -634,7 +639,7 @@ INLINE void spread(Environment& env, const Lanes& lanes) {
 }
 
 // Moves the chains to the end of the step, in which impulses changed their motion.
-INLINE void settle(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after) {
+CALLED void settle(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after) {
     Chain& chain = env.chain;
     Real h = env.laws[0].step_s, half_h = Number(0.5) * h;
     ROOM(Real, first, DOFS, chain.room.settle);
