@@ -221,7 +221,7 @@ def _row(entry: RankedEffect, result: DiagnoseResult) -> list[str]:
         entry.effect,
         ", ".join(entry.acts_in),
         entry.judged_in,
-        f"{entry.score_p:.2g}",
+        f"{entry.score_p:.2g}" if entry.score_p > 0 else "< 1e-300",
         _evidence(entry, result),
         numbers,
     ]
