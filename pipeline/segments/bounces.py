@@ -1,7 +1,9 @@
 """Bounces of a ball: the heights on both sides of each impact, from tracks with or without orientation.
 
 No contact law, no spin and no known height of the ground is needed to find them: a bounce is where a falling height
-turns into a rising one. The frame of the turn and its neighbours may lie within the contact and are left out.
+turns into a rising one. The frame of the turn and its neighbours may lie within the contact and are left out. The
+flight after the last bounce ends where a body that rises so high has fallen back: what it does then (small bounces,
+rolling) is no flight, and would be taken for noise and for the height of the ground.
 """
 
 from __future__ import annotations
@@ -81,7 +83,7 @@ def bounces_of(world: World, whole: Observations) -> list[Bounce]:
     if not alone or not is_round(world.bodies[whole.free[0]]):
         return []
     heights = heights_of(world, world.bodies[whole.free[0]], whole, 0).amin(-1).numpy()
-    found = []
+    found, gravity = [], gravity_into_ground(world)
     for episode in range(len(whole.names)):
         seen = np.flatnonzero(whole.seen[episode, :, 0].numpy() > 0)
         frames = BounceSide(
@@ -89,7 +91,7 @@ def bounces_of(world: World, whole: Observations) -> list[Bounce]:
             height_m=heights[episode][seen],
             position_m=whole.position_m[episode, :, 0].numpy()[seen],
         )
-        found += list(bounces_in(episode, frames))
+        found += list(bounces_in(episode, frames, gravity))
     return found
 
 
@@ -98,8 +100,8 @@ def gravity_into_ground(world: World) -> float:
     return float(-(torch.atleast_2d(world.gravity)[0] @ GroundPlane.of(world).normal))
 
 
-def bounces_in(episode: int, frames: BounceSide) -> Iterator[Bounce]:
-    """Yield the bounces among the frames of an episode (its index) above the ground."""
+def bounces_in(episode: int, frames: BounceSide, gravity_m_s2: float) -> Iterator[Bounce]:
+    """Yield the bounces among the frames of an episode (its index) above the ground, under gravity into the ground."""
     turns = _turns(frames)
     for place, turn in enumerate(turns):
         first = turns[place - 1] + 1 if place else 0
@@ -112,6 +114,8 @@ def bounces_in(episode: int, frames: BounceSide) -> Iterator[Bounce]:
             # frames near the neighbouring bounces may lie within their contacts
             for other in (turns[place - 1 : place] if place else []) + turns[place + 1 : place + 2]:
                 near &= np.abs(frames.time_s[rows] - frames.time_s[other]) > LIMITS.apart_s
+            if last == len(frames):
+                near &= time < _lasts_s(frames.height_m[turn:last], gravity_m_s2) - LIMITS.apart_s
             sides.append(
                 BounceSide(
                     time_s=time[near], height_m=frames.height_m[rows][near], position_m=frames.position_m[rows][near]
@@ -119,6 +123,12 @@ def bounces_in(episode: int, frames: BounceSide) -> Iterator[Bounce]:
             )
         if min(len(side) for side in sides) >= LIMITS.least_frames:
             yield Bounce(episode=episode, before=sides[0], after=sides[1])
+
+
+def _lasts_s(height_m: Array, gravity_m_s2: float) -> float:
+    """Return the duration [s] of a flight that begins at the first of its heights and reaches the highest."""
+    rise = float(height_m.max() - height_m[0])
+    return 2 * float(np.sqrt(2 * rise / gravity_m_s2)) if gravity_m_s2 > 0 else np.inf
 
 
 def _turns(frames: BounceSide) -> list[int]:

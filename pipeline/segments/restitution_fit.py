@@ -73,6 +73,8 @@ class RestitutionFit:
     """Restitution of each impact, shape (n,)."""
     own_std: Array
     """Its standard error from the heights alone, shape (n,)."""
+    own_covariance: Array
+    """Covariance (n, n) of the restitutions about what a law gives at their speeds: heights, ground, drag, scatter."""
     drag_per_m: float
     """k [1/m], the drag that the flights need."""
     lift_m_s2: float
@@ -372,6 +374,7 @@ class _Speeds:
             speeds_m_s=self.speeds,
             own=own,
             own_std=np.sqrt(np.diag(cover)),
+            own_covariance=wider**2 * (cover + (scatter**2 + 1e-12) * np.eye(count)),
             drag_per_m=self.drag,
             lift_m_s2=noise.lift_m_s2,
             shaken_m=noise.shaken_m,

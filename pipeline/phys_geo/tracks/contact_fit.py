@@ -159,7 +159,7 @@ def _found(
         known = replace(ready, world=driven.world(ready.world), start=driven.narrowed(ready.start))
     estimate, record = _contact_estimate(known, data, batch, config, warm_started, record)
     if data.bounces is not None:
-        estimate = with_damping(estimate, damping_of(data.bounces))
+        estimate = with_damping(estimate, damping_of(data.bounces, ready.world, estimate.contact_time_s))
     forces = measured_forces(ready.world, data.searched, batch.observations, force_std_n)
     if driven is not None:
         estimate = driven.put_in(estimate, ready.parameters)

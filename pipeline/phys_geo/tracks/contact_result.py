@@ -55,14 +55,22 @@ class ContactEstimate:
     kept: dict[str, FittedParameter] = field(default_factory=dict)
     """Estimates of an earlier fit that stand in place of parameters which these episodes do not observe, by name."""
 
+    @property
+    def contact_time_s(self) -> float:
+        """Contact time of the law [s]; the prior's where it is not estimated."""
+        found = zip(self.parameters, self.values, strict=True)
+        return next((math.exp(z) for p, z in found if p.name == CONTACT_TIME.name), CONTACT_TIME.prior[0])
+
 
 def with_damping(estimate: ContactEstimate, damping: BounceDamping) -> ContactEstimate:
-    """Return an estimate of the other contact parameters, completed by a damping ratio of its own."""
+    """Return an estimate of other contact parameters, completed by a damping ratio that follows the contact time."""
     place = CONTACT_PARAMETERS.index(DAMPING_RATIO)
+    slope = np.array([damping.by_contact_time if p.name == CONTACT_TIME.name else 0.0 for p in estimate.parameters])
 
     def with_variance(covariance: np.ndarray) -> np.ndarray:
-        wider = np.insert(np.insert(covariance, place, 0.0, 0), place, 0.0, 1)
-        wider[place, place] = damping.variance
+        along = covariance @ slope
+        wider = np.insert(np.insert(covariance, place, along, 0), place, np.insert(along, place, 0.0), 1)
+        wider[place, place] = damping.variance + slope @ along
         return wider
 
     return replace(

@@ -23,7 +23,7 @@ def hopping(rate_hz: float, end_s: float = 0.62) -> BounceSide:
 @pytest.mark.parametrize("rate_hz", [1000.0, 200.0])
 def test_each_bounce_has_the_frames_of_its_two_flights_that_no_contact_may_hold(rate_hz: float) -> None:
     frames = hopping(rate_hz)
-    found = list(bounces_in(7, frames))
+    found = list(bounces_in(7, frames, 9.81))
     turns = [frames.time_s[np.abs(frames.time_s - at).argmin()] for at in IMPACTS_S]
     assert len(found) == 3 and {bounce.episode for bounce in found} == {7}
     clear = np.all([np.abs(frames.time_s - turn) > LIMITS.apart_s for turn in turns], axis=0)
@@ -42,7 +42,7 @@ def test_each_bounce_has_the_frames_of_its_two_flights_that_no_contact_may_hold(
 
 def test_a_bounce_needs_four_frames_on_each_side() -> None:
     frames = hopping(200.0)
-    bounce = next(bounces_in(0, frames))
+    bounce = next(bounces_in(0, frames, 9.81))
     early = float(bounce.before.time_s[LIMITS.least_frames])  # frames before it are kept
     kept = bounce.without((early, 0.02))
     assert kept is not None and len(kept.before) == LIMITS.least_frames
@@ -51,5 +51,5 @@ def test_a_bounce_needs_four_frames_on_each_side() -> None:
     for count in (LIMITS.least_frames, LIMITS.least_frames - 1):  # frames of the last flight, beside that of the turn
         cut = frames.time_s < 0.5525 + 0.005 * count
         short = BounceSide(time_s=frames.time_s[cut], height_m=frames.height_m[cut], position_m=frames.position_m[cut])
-        last = [len(each.after) for each in bounces_in(0, short)][2:]
+        last = [len(each.after) for each in bounces_in(0, short, 9.81)][2:]
         assert last == ([count] if count == LIMITS.least_frames else [])

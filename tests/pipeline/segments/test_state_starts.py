@@ -188,7 +188,7 @@ def test_the_flights_of_a_bounce_end_before_the_contacts_of_its_neighbours() -> 
     frames = side(heights.tolist(), t)
     turns = _turns(frames)
     assert np.allclose(t[turns], [0.05, 0.15, 0.25, 0.35])
-    found = list(bounces_in(7, frames))
+    found = list(bounces_in(7, frames, 9.81))
     assert len(found) == 4 and all(one.episode == 7 for one in found)
     for one, at in zip(found, t[turns], strict=True):
         for part, sign in ((one.before, -1), (one.after, 1)):
@@ -203,4 +203,4 @@ def test_the_flights_of_a_bounce_end_before_the_contacts_of_its_neighbours() -> 
                 abs(np.abs(part.time_s).max() - (abs(ends - at) - (BOUNCE.apart_s if 0 < ends < t[-1] else 0))) < 0.0041
             )
     few = side(heights[:27].tolist(), t[:27])
-    assert list(bounces_in(0, few)) == []  # one frame after the bounce is no flight
+    assert list(bounces_in(0, few, 9.81)) == []  # one frame after the bounce is no flight
