@@ -41,6 +41,7 @@ from ...trajectories.track_noise import Noise, estimate_noise
 from .driven_result import DrivenFit, Pressed
 from .force_driven import LOADED, ForceDriven, Grid, Pushes, Samples, between, hit_errors, impulse_errors, loaded
 from .joint_tracks import JointTracks
+from .loss_posterior import posterior
 from .measured_forces import force_noise
 from .slip_friction import slip_friction
 
@@ -72,11 +73,13 @@ OPEN = 10.0
 between samples, in that size: such forces have a sign, and a narrow prior about 0 would draw the other numbers."""
 MOVES = 4.0
 """Speed, in standard deviations, above which a joint moves; beside what it may lose between frames."""
-ITERATIONS, TOLERANCE = 40, 1e-5
+ITERATIONS, TOLERANCE = 80, 1e-5
 """Limit on steps of a descent, and the share of the cost below which a step ends it."""
 NOTED = ((0.0, 1.0, 5.0), (0.5, 0.5, 1.5), (0.0, 1.0, 5.0))
 """Median, standard deviation and largest size of the delay, in half intervals between samples, of the part of a mean
 that samples are, 0 for samples and 1 for means, and of the offset of the sensor's zero, in its standard deviation."""
+FLAT = 0.1
+"""Information of the prior of a loss in a descent, in its unit, as a root: draws have the real one."""
 MOST_CORRELATION = 0.98
 """Largest correlation of neighbouring residuals that is believed."""
 
@@ -171,6 +174,9 @@ class _Data:
     """Standard deviation of that generalised force, shape (E, parts, J)."""
     late_s: float
     """Standard deviation of the time by which forces are noted too late [s]."""
+    units: Tensor
+    """Units in which losses, in which the motion is linear, are coordinates; 0 for a factor, whose logarithm is one,
+    shape (P,)."""
 
     @staticmethod
     def of(world: World, pushed: Sequence[_Pushed], noise: Noise) -> _Data | None:
@@ -206,6 +212,7 @@ class _Data:
             part=part,
             part_std=std,
             late_s=0.5 * float(np.median(interval)),
+            units=torch.tensor([*(p.prior[0] for p in losses), 0.0], dtype=torch.float64),
         )
 
     def residuals(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
@@ -223,13 +230,15 @@ class _Data:
 
     def _residuals(self, point: Tensor, episode: Tensor) -> Tensor:
         count, joints = len(self.parameters), self.tracks.values.shape[2]
-        column = {p.name: p.decode(point[:, k]) for k, p in enumerate(self.parameters)}
+        values = torch.where(self.units > 0, self.units * point[:, :count], point[:, :count].exp())
+        column = {p.name: values[:, k] for k, p in enumerate(self.parameters)}
         state = point[:, count + len(NOTED) :].unflatten(1, (-1, joints))
         first = [
             middle[episode] + std[episode] * state[:, k]
             for k, (middle, std) in enumerate(zip(self.start[:2], self.start[2:], strict=True))
         ]
-        force = self.part_std[episode] * state[:, 2:]
+        # in proportion to the masses, so that a factor of these leaves what unknown forces move where it is
+        force = self.part_std[episode] * state[:, 2:] * values[:, count - 1, None, None]
         more = force.gather(1, self.part[episode][..., None].expand(-1, -1, joints))
         late = torch.tensor([self.late_s, 1.0, 1.0]).to(point)
         noted = late * point[:, count : count + len(NOTED)]
@@ -404,7 +413,7 @@ def _root(information: Tensor) -> Tensor:
 
 
 def _first_losses(data: _Data) -> NDArray[np.float64]:
-    """Return a first guess of the parameters (P,): losses by the change of momentum between frames that move."""
+    """Return a first guess (P,): losses by the change of momentum between frames that move, 1 for factors."""
     tracks, driven = data.tracks, data.driven
     balance, shape = tracks.balance(), tracks.values.shape
     total = sum((p.at_frames(balance, tracks, driven.grid) for p in driven.pushes), torch.zeros_like(tracks.values))
@@ -414,7 +423,7 @@ def _first_losses(data: _Data) -> NDArray[np.float64]:
     change = (mass @ (tracks.speeds.diff(dim=1) / length)[..., None])[..., 0]
     lost = 0.5 * (total[:, 1:] + total[:, :-1]) - change
     speed = 0.5 * (tracks.speeds[:, 1:] + tracks.speeds[:, :-1])
-    found = np.array([p.encode(p.prior[0]) for p in data.parameters])
+    found = np.array([p.prior[0] for p in data.parameters])
     for j, name in enumerate(driven.chain.joint_names):
         moves = (driven.sense[..., j] != 0) & lost[..., j].isfinite()
         if not bool(moves.any()):
@@ -424,8 +433,7 @@ def _first_losses(data: _Data) -> NDArray[np.float64]:
             ("damping", "friction"), nnls(rows.numpy(), lost[..., j][moves].numpy())[0], strict=True
         ):
             k = [p.name for p in data.parameters].index(f"{name}.{number}")
-            if value > 0:  # else the prior's median: the logarithm of a loss that is far too small has no slope
-                found[k] = np.clip(data.parameters[k].encode(float(value)), *data.parameters[k].limits)
+            found[k] = np.clip(float(value), *data.parameters[k].bounds)
     return found
 
 
@@ -454,11 +462,19 @@ def _pressed(data: _Data) -> list[Pressed]:
 
 def _fitted(data: _Data) -> DrivenFit:
     """Return the estimate with its covariance."""
-    noted = [((-most, most), middle, std) for middle, std, most in NOTED]
-    every = [(p.limits, p.encode(p.prior[0]), p.prior[1]) for p in data.parameters] + noted
+    start, units = _first_losses(data), data.units.numpy()
+    units = np.where(units > 0, np.maximum(start, units), 0.0)
+    data = replace(data, units=torch.as_tensor(units))
+    first = [
+        ((p.bounds[0] / unit, p.bounds[1] / unit), value / unit, 1 / FLAT)
+        if unit
+        else (p.limits, p.encode(p.prior[0]), p.prior[1])
+        for p, unit, value in zip(data.parameters, units, start, strict=True)
+    ]
+    every = first + [((-most, most), middle, std) for middle, std, most in NOTED]
     bounds = torch.tensor([limits for limits, _, _ in every], dtype=torch.float64)
     centre, known = torch.tensor([(middle, std**-2) for _, middle, std in every], dtype=torch.float64).T
-    point = torch.cat((torch.as_tensor(_first_losses(data)), centre[len(data.parameters) :]))
+    point = centre.clone()
     states, best = torch.zeros(len(data.part), data.size).to(centre), None
     for scale in (None, ROBUST_SCALE):  # far from the tracks a robust loss has no slope
         best = minimise(
@@ -475,8 +491,12 @@ def _fitted(data: _Data) -> DrivenFit:
         )
         point, states = best.shared, best.states
     assert best is not None
-    covariance, record = _covariance(data, best, known)
     count = len(data.parameters)
+    record = _misfit(data, best)
+    information, slopes = best.information.numpy() / record["information_over"], best.scores.numpy()
+    own, slope = _without_noted(information, slopes.sum(0) / record["information_over"], best, centre, known, count)
+    values, covariance = posterior(best.shared[:count].numpy(), units, own, slope, data.parameters)
+    wider = _scatter(information, slopes / record["information_over"], np.diag(known.numpy()))[:count]
     record |= {
         "episodes": len(data.part),
         "frames": int(data.tracks.shown.sum()),
@@ -490,15 +510,27 @@ def _fitted(data: _Data) -> DrivenFit:
     }
     return DrivenFit(
         parameters=data.parameters,
-        values=best.shared[:count].numpy(),
-        covariance=covariance[:count, :count],
+        values=values,
+        covariance=covariance * np.outer(wider, wider),
         pressed=_pressed(data),
         record=record,
     )
 
 
-def _covariance(data: _Data, end: Solution, known: Tensor) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Return the covariance (P + 3, P + 3) of the parameters, and how far data and model differ.
+def _without_noted(
+    information: NDArray[Any], slope: NDArray[Any], end: Solution, centre: Tensor, known: Tensor, count: int
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return information (P, P) and slope (P,) of the data with what is not known of the sensor eliminated."""
+    rest = slice(count, None)
+    own = information[rest, rest] + np.diag(known.numpy()[rest])
+    pull = slope[rest] + (known * (centre - end.shared)).numpy()[rest]
+    follow = np.linalg.solve(own, np.concatenate((information[rest, :count], pull[:, None]), 1))
+    across = information[:count, rest]
+    return information[:count, :count] - across @ follow[:, :-1], slope[:count] - across @ follow[:, -1]
+
+
+def _misfit(data: _Data, end: Solution) -> dict[str, Any]:
+    """Return how far tracks and model differ, and by how much their information is divided.
 
     The misfit is that of the residuals by their degrees of freedom. A state whose variance is a share v of its prior's
     takes 1 - v of one.
@@ -513,12 +545,14 @@ def _covariance(data: _Data, end: Solution, known: Tensor) -> tuple[NDArray[Any]
     ahead = float((found[:, 1:] * found[:, :-1])[pairs].sum())
     correlation = min(max(ahead / max(float(found.square()[seen].sum()), 1e-30), 0.0), MOST_CORRELATION)
     grown = max(1.0, misfit * (1 + correlation) / (1 - correlation))
-    prior = np.diag(known.numpy())
-    covariance = np.linalg.inv(end.information.numpy() / grown + prior)
-    slopes = end.scores.numpy() / grown
-    if len(slopes) >= MANY_EPISODES:
-        slopes = slopes - slopes.mean(0)
-        scatter = covariance @ (len(slopes) / (len(slopes) - 1) * slopes.T @ slopes + prior) @ covariance
-        wider = np.sqrt(np.maximum(1.0, np.diag(scatter) / np.diag(covariance)))
-        covariance = covariance * np.outer(wider, wider)
-    return covariance, {"misfit": misfit, "correlation": correlation, "information_over": grown}
+    return {"misfit": misfit, "correlation": correlation, "information_over": grown}
+
+
+def _scatter(information: NDArray[Any], slopes: NDArray[Any], prior: NDArray[Any]) -> NDArray[Any]:
+    """Return the factors of standard errors by which episodes (E) scatter more than they should; 1 for few of them."""
+    episodes = len(slopes)
+    if episodes < MANY_EPISODES:
+        return np.ones(len(prior))
+    plain, off = np.linalg.inv(information + prior), slopes - slopes.mean(0)
+    scatter = plain @ (episodes / (episodes - 1) * off.T @ off + prior) @ plain
+    return np.sqrt(np.maximum(1.0, np.diag(scatter) / np.diag(plain)))
