@@ -7,7 +7,8 @@ loss, in any unit, and of the logarithm of the factor, from the best point, info
 
     log p = -u' H u / 2 + g' u - sum ((z - m) / s)^2 / 2,
 
-which is drawn by an ensemble of walkers (stretch moves: Goodman and Weare, 2010). An interval reaches between the
+of which draws of the normal density, weighted by the priors, are a first sample, and an ensemble of walkers that begin
+there the final one (stretch moves: Goodman and Weare, 2010). An interval reaches between the
 quantiles of the draws, in logarithms; where the data tell all numbers it is that of the curvature.
 """
 
@@ -21,8 +22,11 @@ from numpy.typing import NDArray
 
 from ...physics.parameters import Parameter
 
-WALKERS, STEPS, STRETCH = 400, 400, 2.0
-"""Walkers of the ensemble, their steps, of which the second half counts, and the largest stretch of a move."""
+DRAWS, WALKERS, STEPS, STRETCH = 100_000, 400, 200, 2.0
+"""Draws of the normal density, walkers of the ensemble, their steps, of which the second half counts, and the largest
+stretch of a move."""
+WEAK = 0.1
+"""Information, as a root, that makes the normal density one where the data tell nothing, in units of the losses."""
 END = 1.96
 """End of an interval, in standard errors."""
 
@@ -54,11 +58,18 @@ def posterior(
         inside = ((z >= low) & (z <= high)).all(1)
         return np.where(inside, data - 0.5 * np.square((z - middle) / width).sum(1), -np.inf)
 
-    rng = np.random.default_rng(0)
-    wide = np.linalg.inv(information + np.diag(np.where(linear, 1e-2, width**-2)))
-    u = rng.multivariate_normal(best, wide, WALKERS)
-    z = np.where(linear, np.log(np.maximum(u, 1e-9) * np.where(linear, units, 1.0)), u)
-    draws = _drawn(height, np.clip(z, low, high))
+    rng, known = np.random.default_rng(0), np.where(linear, WEAK, 1 / width) ** 2
+    precision = information + np.diag(known)
+    off = rng.multivariate_normal(np.linalg.solve(precision, slope), np.linalg.inv(precision), DRAWS)
+    u = best + off
+    u = u[(u > 0).all(1, where=linear)]
+    z = np.where(linear, np.log(np.where(linear, u * np.where(linear, units, 1.0), 1.0)), u)
+    normal = (u - best) @ slope - 0.5 * np.einsum("ki,ij,kj->k", u - best, precision, u - best)
+    weight = height(z) - normal - z.sum(1, where=linear)
+    share = np.exp(weight - weight.max(initial=-np.inf)) if len(u) else np.zeros(0)
+    if not share.sum() > 0:
+        z, share = np.clip(middle + width * rng.standard_normal((WALKERS, len(best))), low, high), np.ones(WALKERS)
+    draws = _drawn(height, z[rng.choice(len(z), WALKERS, p=share / share.sum())])
     bounds = np.quantile(draws, [0.025, 0.975], axis=0)
     std = (bounds[1] - bounds[0]) / (2 * END)
     return bounds.mean(0), np.corrcoef(draws.T).reshape(len(std), -1) * np.outer(std, std)

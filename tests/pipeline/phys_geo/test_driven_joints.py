@@ -12,6 +12,7 @@ from cgwm.pipeline.phys_geo.tracks.driven_joints import fit_driven_joints
 from cgwm.pipeline.phys_geo.tracks.driven_result import DrivenFit, Pressed, with_nuisance
 from cgwm.pipeline.phys_geo.tracks.force_driven import ForceDriven, Grid, Pushes, Samples, hit_errors, impulse_errors
 from cgwm.pipeline.phys_geo.tracks.joint_tracks import parabola_speeds
+from cgwm.pipeline.phys_geo.tracks.loss_posterior import posterior
 from cgwm.pipeline.physics.chain import Chain, Joint
 from cgwm.pipeline.physics.chain_parameters import mass_factor
 from cgwm.pipeline.physics.chain_values import with_chain_values
@@ -159,6 +160,47 @@ def test_a_speed_before_a_jump_is_that_before_it() -> None:
     speeds, _ = parabola_speeds(times, way, np.full_like(way, 1e-3), jumps)
     np.testing.assert_allclose(speeds[:, 0], np.where(times <= 0.5 + 1e-9, 0.0, 1.0), atol=1e-9)
     assert 0.1 < parabola_speeds(times, way, np.full_like(way, 1e-3))[0][10, 0] < 0.9
+
+
+def test_a_push_on_a_door_acts_by_its_arm() -> None:
+    """Without a loss, I a'' = F r as long as the angle is small."""
+    hinge = Joint.of("hinge", "hinge", "drawer", "case", axis=(0, 0, 1))
+    one = driven(0.01, 0)
+    chain = replace(one.chain, joints=(hinge,))
+    place = torch.zeros_like(one.pushes[0].place_m) + torch.tensor([0.3, 0.0, 0.0], dtype=F64)
+    force = np.tile([0.0, 0.01, 0.0], (20, 1))
+    samples = Samples.of([Track(np.linspace(0, 1, 20), np.zeros((20, 3)), force_n=force)])
+    exerted = replace(one.pushes[0], place_m=place, samples=samples)
+    door = replace(one, world=replace(one.world, chains=(chain,)), chain=chain, pushes=[exerted])
+    none = torch.zeros(1, 1, dtype=F64)
+    moved = door.motion({}, torch.tensor([0]), [none, none], torch.zeros(1, 10, 1, dtype=F64), none.expand(1, 3))
+    body = world().bodies[1]
+    inertia = float(body.inertia[0, 2, 2] + body.mass[0] * body.com[0].square().sum())
+    t = np.arange(0, 0.51, 0.05)
+    np.testing.assert_allclose(moved[0, :, 0], 0.5 * 0.003 / inertia * t**2, rtol=1e-3, atol=1e-9)
+
+
+def test_intervals_are_those_of_the_curvature_where_data_tell_all() -> None:
+    names = fitted().parameters
+    best, units = np.array([1.0, 1.0, 0.1]), np.array([DAMPING, FRICTION, 0.0])
+    root = np.array([[60.0, 20.0, 5.0], [0.0, 80.0, 10.0], [0.0, 0.0, 50.0]])
+    values, covariance = posterior(best, units, root.T @ root, np.zeros(3), names)
+    std = np.sqrt(np.diag(np.linalg.inv(root.T @ root)))
+    np.testing.assert_allclose(values, [*np.log([DAMPING, FRICTION]), 0.1], atol=0.15 * std.max())
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=0.1)
+
+
+def test_a_sum_of_losses_leaves_each_of_them_open() -> None:
+    """Known is friction + 0.1 damping = 3 to a hundredth: the best point says nothing of either."""
+    names = fitted().parameters
+    row = np.array([0.1, 1.0, 0.0])
+    information = np.outer(row, row) / 0.03**2
+    for damping in (0.5, 20.0):
+        best = np.array([damping, 3.0 - 0.1 * damping, 0.0])
+        values, covariance = posterior(best, np.array([1.0, 1.0, 0.0]), information, np.zeros(3), names)
+        reach = 1.96 * np.sqrt(np.diag(covariance))
+        low, high = np.exp(values - reach), np.exp(values + reach)
+        assert low[0] < 0.02 and high[0] > 5 and low[1] < 2.5 and 2.95 < high[1] < 3.2
 
 
 def test_a_factor_of_all_masses_moves_masses_and_inertias() -> None:
