@@ -107,6 +107,16 @@ GROUND_SHIFT = Parameter(
         "the ground seems to lie 2 cm or more above [world] ground. Check that, the scale and the shape",
     ),
 )
+GAP = Parameter(
+    name="gap_m",
+    unit="m",
+    bounds=(-0.001, 0.001),
+    logarithmic=False,
+    reveals="a touch without a load",
+    prior=(0.0, 0.0002),
+)
+"""How much larger a driven body is than its shape, which parts and the frames of their tracks leave open: a nuisance of
+what is told by how deep bodies press into each other."""
 CONTACT_PARAMETERS = (FRICTION, CONTACT_TIME, DAMPING_RATIO)
 """Coefficients of the contact law."""
 PAPER_PARAMETERS = (
@@ -142,6 +152,15 @@ def _of_pair(parameter: Parameter, pair: tuple[str, str] | None, median: float |
         return parameter
     reveals = f"{parameter.reveals}, between {pair[0]} and {pair[1]}"
     return replace(parameter, name=of_pair(parameter.name, pair), reveals=reveals)
+
+
+def gap_parameters(world: World) -> list[Parameter]:
+    """Return the gaps of driven bodies that push links, whose losses and contacts are small beside them.
+
+    A driven body with flat faces keeps its shape.
+    """
+    pushing = [body for body in world.bodies if world.chains and body.motion == "driven" and body.hull is None]
+    return [replace(GAP, name=f"{body.name}.{GAP.name}") for body in pushing]
 
 
 def contact_values(world: World) -> dict[str, float]:
@@ -251,6 +270,9 @@ def apply_parameters(world: World, parameters: Sequence[Parameter], values: Tens
         world = with_chain_values(world, column)
     for index, body in enumerate(world.bodies):
         changes = _mass_distribution_of(body, column)
+        gap = column.get(f"{body.name}.{GAP.name}")
+        if gap is not None:
+            changes["radii"] = body.radii + gap[:, None]
         world = world.with_body(index, **changes) if changes else world
     return world
 

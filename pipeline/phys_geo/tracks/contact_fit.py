@@ -44,6 +44,7 @@ from ...physics.parameters import (
     contact_parameters,
     contact_values,
     effect_parameters,
+    gap_parameters,
     mass_distribution,
 )
 from ...physics.world import World
@@ -168,6 +169,7 @@ def _found(
         note("phys-geo: measured forces")
         estimate, told = with_forces(ready.world, estimate, forces, batch.observations, batch.start_cov)
         record = replace(record, forces=told)
+    estimate = estimate.without([p.name for p in gap_parameters(ready.world)])
     return physics_fit(known.world, earlier.kept_in(known.world, estimate), data.noise, record)
 
 
@@ -271,7 +273,8 @@ def _fitted_before(
     # with few episodes the search cannot separate the ground's height from the bouncing; shooting can
     height = world.ground_normal is not None and len(data.episodes) >= ENOUGH_EPISODES
     contact = _of_seen_pairs(world, contact_parameters(world, medians), data.episodes)
-    names = [*contact, *chain_parameters(world), *([GROUND_SHIFT] if height else [])]
+    gaps = [] if data.airborne else gap_parameters(world)
+    names = [*contact, *chain_parameters(world), *gaps, *([GROUND_SHIFT] if height else [])]
     start = [(p, _start(world, p) if warm_started else p.prior[0]) for p in names]
     world, start = with_bounces(world, start, data.bounces)
     world, mass, choice = _with_chosen_parts(world, data, config, start)

@@ -55,6 +55,17 @@ class ContactEstimate:
     kept: dict[str, FittedParameter] = field(default_factory=dict)
     """Estimates of an earlier fit that stand in place of parameters which these episodes do not observe, by name."""
 
+    def without(self, names: Sequence[str]) -> ContactEstimate:
+        """Return the estimate without some parameters, which were nuisances."""
+        kept = [k for k, p in enumerate(self.parameters) if p.name not in names]
+        return replace(
+            self,
+            parameters=[self.parameters[k] for k in kept],
+            values=self.values[kept],
+            covariance=self.covariance[np.ix_(kept, kept)],
+            spread=None if self.spread is None else self.spread[np.ix_(kept, kept)],
+        )
+
     @property
     def contact_time_s(self) -> float:
         """Contact time of the law [s]; the prior's where it is not estimated."""

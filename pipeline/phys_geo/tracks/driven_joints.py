@@ -33,7 +33,7 @@ from torch import Tensor
 from ....datasets.capture.tracks import Episode, Track
 from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
 from ...physics.chain_parameters import chain_parameters, mass_factor
-from ...physics.parameters import Parameter
+from ...physics.parameters import GAP, Parameter, gap_parameters
 from ...physics.world import World
 from ...trajectories.initial_state import clearance
 from ...trajectories.observations import Observations
@@ -440,6 +440,7 @@ def _first_losses(data: _Data) -> NDArray[np.float64]:
 def _pressed(data: _Data) -> list[Pressed]:
     """Return what forces tell of each driven body and the link that it pushes."""
     found, tracks, pushed = [], data.tracks, data.pushed
+    fitted_gaps = {p.name for p in gap_parameters(tracks.world)}
     balance, names = tracks.balance(), tracks.world.body_names
     driven = [name for name in names if any(name in one.std_n for one in pushed)]
     for name, push in zip(driven, data.driven.pushes, strict=True):
@@ -456,7 +457,9 @@ def _pressed(data: _Data) -> list[Pressed]:
         path = float(np.median([estimate_noise([track]).position_m for _, track, _ in seen]))
         pair = tracks.world.materials_of(names.index(tracks.chain.links[push.link]), names.index(name))
         friction = slip_friction(tracks, name, push.link, seen)
-        found.append(Pressed(pair=pair, friction=friction, rate_m_s2=rate, path_std_m=path))
+        fitted = f"{name}.{GAP.name}" in fitted_gaps
+        gap = path if fitted else math.hypot(path, GAP.prior[1])
+        found.append(Pressed(pair=pair, friction=friction, rate_m_s2=rate, gap_std_m=gap))
     return found
 
 

@@ -4,8 +4,9 @@ Losses and mass by momentum, and friction by sliding, are known without the cont
 motion says of them, and a search for the law begins with them. What the motion says of the law's contact time and
 damping ratio rests on how deep bodies press into each other, which is the difference of tracks and shapes. Under a load
 F a contact is p = tau^2 F / m deep, so that an error g of the gap moves the logarithm of tau by g / (2 p), and that of
-the damping ratio, whose damper is told by speeds, as much. The gap is a nuisance: with information I of the data, prior
-P and covariance V of what the nuisance moves,
+the damping ratio, whose damper is told by speeds, as much. A shape that is off is fitted in the search, as a
+parameter that is dropped afterwards. Noise of the path is a nuisance: with information I of the data, prior P and
+covariance V of what the nuisance moves,
 
     C = (I (1 + V I)^-1 + P)^-1,
 
@@ -29,10 +30,6 @@ from ...physics.parameters import CONTACT_TIME, DAMPING_RATIO, FRICTION, GROUND_
 from ...physics.world import World
 from .contact_result import ContactEstimate
 
-GAP_M = 2e-4
-"""Standard deviation of the gap between a driven body and a link by their shapes, and by where their frames are in
-them [m]; the noise of the path comes in addition."""
-
 Start = tuple[Parameter, float]
 """A parameter of a search, and where it starts."""
 
@@ -47,13 +44,14 @@ class Pressed:
     """Logarithm of their friction, and its variance; None where nothing slides for sure."""
     rate_m_s2: float
     """Usual force between them, by the mass that it moves [m/s2]; 0 where nothing presses."""
-    path_std_m: float
-    """Noise of a coordinate of the path of the driven body [m]."""
+    gap_std_m: float
+    """Error of the gap between them that a search does not know [m]: noise of the path of the driven body and, where
+    its shape is not fitted, that of the shape."""
 
     def moved_by_gap(self, contact_time_s: float) -> float:
         """Return the standard deviation of the logarithm of a contact time by the error of the gap."""
         depth = self.rate_m_s2 * contact_time_s**2
-        return math.hypot(GAP_M, self.path_std_m) / (2 * depth) if depth > 0 else 0.0
+        return self.gap_std_m / (2 * depth) if depth > 0 else 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,14 +9,14 @@ from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate
 from cgwm.pipeline.phys_geo.tracks.driven_joints import fit_driven_joints
-from cgwm.pipeline.phys_geo.tracks.driven_result import DrivenFit, Pressed, with_nuisance
+from cgwm.pipeline.phys_geo.tracks.driven_result import DrivenFit, with_nuisance
 from cgwm.pipeline.phys_geo.tracks.force_driven import ForceDriven, Grid, Pushes, Samples, hit_errors, impulse_errors
 from cgwm.pipeline.phys_geo.tracks.joint_tracks import parabola_speeds
 from cgwm.pipeline.phys_geo.tracks.loss_posterior import posterior
 from cgwm.pipeline.physics.chain import Chain, Joint
 from cgwm.pipeline.physics.chain_parameters import mass_factor
 from cgwm.pipeline.physics.chain_values import with_chain_values
-from cgwm.pipeline.physics.parameters import contact_parameters
+from cgwm.pipeline.physics.parameters import apply_parameters, contact_parameters, gap_parameters
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.chains import chained, link
@@ -240,6 +240,14 @@ def test_what_forces_tell_takes_the_place_of_what_the_motion_says() -> None:
     np.testing.assert_allclose(found.covariance[3:, 3:], fit.covariance)
     assert found.covariance[0, 0] == names[0].prior[1] ** 2  # nothing slides
     depth = fit.pressed[0].rate_m_s2 * 0.01**2
-    known = Pressed(pair=None, friction=None, rate_m_s2=fit.pressed[0].rate_m_s2, path_std_m=0.0)
+    known = replace(fit.pressed[0], gap_std_m=2e-4)
     assert abs(known.moved_by_gap(0.01) / (2e-4 / (2 * depth)) - 1) < 1e-12
-    assert 0.2 < np.sqrt(found.covariance[1, 1]) < names[1].prior[1]
+    moved = replace(fit, pressed=[known]).put_in(estimate, usual)
+    assert 0.2 < np.sqrt(moved.covariance[1, 1]) < names[1].prior[1]
+
+
+def test_a_gap_makes_the_finger_larger() -> None:
+    (gap,) = gap_parameters(world())
+    assert gap.name == "finger.gap_m" and not gap_parameters(replace(world(), chains=()))
+    larger = apply_parameters(world(), [gap], torch.tensor([[1e-4], [-2e-4]], dtype=F64))
+    np.testing.assert_allclose(larger.bodies[2].radii[:, 0], [0.0101, 0.0098])
