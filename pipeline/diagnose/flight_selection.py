@@ -59,11 +59,13 @@ class FlightSelection(NamedTuple):
         return self._replace(steps=[_with_numbers(step, numbers) for step in self.steps])
 
     def without(self, names: set[str]) -> FlightSelection:
-        """Leave out some effects, and fit the others again."""
+        """Leave out some effects, with those that act through them, and fit the others again."""
         if self.flight is None:
             return self
         world, flight = _without(self.flight, self.world, names)
-        return FlightSelection([step for step in self.steps if step.best.name not in names], world, flight)
+        left = {active.effect.name for active in world.effects}
+        gone = names | ({active.effect.name for active in self.world.effects} - left)
+        return FlightSelection([step for step in self.steps if step.best.name not in gone], world, flight)
 
     def without_idle(self) -> FlightSelection:
         """Leave out the effects that have no number, or without which held-out flights are predicted as well.
@@ -185,7 +187,8 @@ def judged(
     fleeting = frozenset(without_lasting(found.flight, found.world, found.names, scatter))
     wrong = {one.effect for one in others if one.likelier} | fleeting
     if wrong and set(found.names) - wrong:
-        found = found.without(wrong)
+        left = found.without(wrong)
+        found = left if left.names else found  # a wind is none without the drag through which it acts
     found = _without_levelling(prepared, found, scatter)
     agreement = _agreement(prepared, found, found.names, scatter)
     if slow is not None and agreement is not None and (agreement.doubtful or followed):

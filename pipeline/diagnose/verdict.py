@@ -90,10 +90,9 @@ def find(
     contact = with_contact(prepared, world, flown.world, flown.steps, candidates, flown.segments, explained, tests)
     note("diagnose: held-out episodes")
     errors = _errors(contact, flown)
-    # what flights show may be what contact imitates, but for a misfit alone that does not repeat
+    # what flights show may be what contact imitates
     limits = THRESHOLDS.segments
-    imitated = flown.recurs or bool(flown.own) or (flown.remains and bool(flown.in_flight))
-    contact = _without_useless(contact, limits.confirmed if imitated else -limits.worse_t)
+    contact = _without_useless(contact, limits.confirmed if flown.remains or flown.own else -limits.worse_t)
     in_contact = any(one.where == "contact" for one in contact.chosen)
     misfits = () if contact.segments is None or in_contact else misfits_of(contact.segments)
     verdict = _verdict(contact.chosen, flown)

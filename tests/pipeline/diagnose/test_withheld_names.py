@@ -24,7 +24,7 @@ from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.contact_law import Touch
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.friction_ellipse import Ellipse
-from cgwm.pipeline.segments.candidates import base_parameters
+from cgwm.pipeline.segments.candidates import base_parameters, without_effect
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.segments.segment_fit import refit
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -105,6 +105,17 @@ def test_an_effect_without_which_held_out_flights_are_predicted_as_well_is_not_n
         names, {"ground_magnet": {"A": (0.0, 1.0)}, "wind": {"w_x": (0.0, 1.0), "w_y": (-0.5, 1.0)}}
     ).without_idle()
     assert zero.names == [name for name in left if name in needed and name == "linear_drag"]
+
+
+def test_a_wind_goes_with_the_drag_through_which_it_acts(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = {"linear_drag": {"c": 0.3}, "wind": {"w_x": 1.0, "w_y": 0.0}, "gravity_tilt": {"tilt_x": 0.01}}
+    steps = [SelectionStep((), (evidence(name),), True) for name in values]
+    monkeypatch.setattr(
+        flight_selection, "_without", lambda flight, world, names: (without_effect(world, *names), flight)
+    )
+    found = FlightSelection(steps, world_with("ball", values), SimpleNamespace())  # type: ignore[arg-type]
+    left = found.without({"linear_drag"})
+    assert left.names == ["gravity_tilt"] == [active.effect.name for active in left.world.effects]
 
 
 @pytest.mark.parametrize(("fall", "least", "stays"), [(-1.2, -1.0, False), (-0.5, -1.0, True), (1.5, 2.0, False)])
