@@ -99,10 +99,9 @@ class _Progress:
 
     def _with_contact_motion(self, where: str, kind: type[SlidingStart | ImpactStart], prepared: Prepared) -> _Progress:
         """Add the effects that one kind of contact motion identifies."""
-        # an effect of flight that flights do not identify is not fitted here
-        names = [
-            a.effect.name for a in self.world.effects if a.effect.name in self.missing and kind.may_identify(a.effect)
-        ]
+        missing = [a.effect for a in self.world.effects if a.effect.name in self.missing]
+        # a force that no flight identified would be taken for the effects of contact: all are fitted together then
+        names = [] if any(e.phase == "flight" for e in missing) else [e.name for e in missing if kind.may_identify(e)]
         motion = kind.of(prepared, _without(self.world, names)) if names else None
         if motion is None:
             return self

@@ -46,6 +46,18 @@ def test_glides_give_an_effect_with_the_friction_where_a_search_starts() -> None
     assert float(placed["rolling_resistance"]["c_r"]) == found.parameters[0].estimate
 
 
+def test_a_tilt_that_no_flight_shows_is_fitted_together_with_the_resistance_of_a_ball_that_rolls_on_it() -> None:
+    """Fitted alone to glides, the resistance took what the tilt does: both were wrong, with intervals of no width."""
+    truth = {"gravity_tilt": {"tilt_x": 0.01, "tilt_y": -0.03}, "rolling_resistance": {"c_r": 0.0008}}
+    nothing = world_with("ball", {name: {} for name in truth})
+    found = fit_effects(nothing, rolls(truth, count=5), values(nothing), NOISE)
+    assert "in_glides" not in found.record
+    for parameter in found.parameters:
+        name, _, number = parameter.name.partition(".")
+        assert parameter.estimate == pytest.approx(truth[name][number], rel=0.05), parameter.name
+        assert inside(parameter, truth[name][number])
+
+
 @pytest.mark.evidence
 def test_intervals_from_glides_hold_the_truth() -> None:
     """Of 40 that are to hold it in 95 %, fewer than 34 would come about once in 700 times."""
