@@ -186,7 +186,7 @@ def judged(
     )
     fleeting = frozenset(without_lasting(found.flight, found.world, found.names, scatter))
     wrong = {one.effect for one in others if one.likelier} | fleeting
-    if wrong and set(found.names) - wrong:
+    if wrong and set(found.names) - wrong and not _is_mostly_other(found, others):
         left = found.without(wrong)
         found = left if left.names else found  # a wind is none without the drag through which it acts
     found = _without_levelling(prepared, found, scatter)
@@ -195,6 +195,16 @@ def judged(
         found = _without_contradicted(prepared, found, scatter, followed)
         agreement = _agreement(prepared, found, found.names, scatter)
     return JudgedSelection(selection=found, others=others, fleeting=fleeting, agreement=agreement)
+
+
+def _is_mostly_other(found: FlightSelection, others: Sequence[OtherForms]) -> bool:
+    """Return whether the selected effect with the most evidence is known to be a force of another law.
+
+    The others are then fitted beside a law that is wrong, and what it leaves may look like any of them.
+    """
+    named = [step.best for step in found.steps if step.best.name in found.names]
+    most = min(named, key=lambda one: math.inf if one.delta_bic is None else one.delta_bic)
+    return any(one.effect == most.name and one.odds > LIMITS.other_law for one in others)
 
 
 def _without_levelling(prepared: Prepared, found: FlightSelection, scatter: float) -> FlightSelection:

@@ -330,6 +330,15 @@ class VerdictThresholds:
         "report11 and report12, at odds of 4 then: 1 of 36 in no library get a wrong name, and 0 of 48 effects of "
         "flight and measurement, 19 of which get their own",
     )
+    other_law: float = threshold(
+        2 * math.log(100),
+        "2 log odds",
+        "where other forms of the effect with the most evidence are likelier than its own law by more than this, no "
+        "effect beside it is named either: it was fitted beside a wrong law",
+        "by argument: as `flight.implausible`; a force below a height in real-like report13, called a scale of lengths "
+        "with a tilt beside it, was looked at",
+        "takes away none of the names in 250 real-like captures of development",
+    )
     unlike_fall: tuple[float, float] = threshold(
         (0.5, 8.0),
         "weights, standard deviations",

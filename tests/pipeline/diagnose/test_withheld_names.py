@@ -18,6 +18,7 @@ from cgwm.pipeline.diagnose.evidence import Evidence
 from cgwm.pipeline.diagnose.flight_selection import FlightSelection
 from cgwm.pipeline.diagnose.friction_pyramid import FrictionPyramid
 from cgwm.pipeline.diagnose.lasting_forces import without_lasting
+from cgwm.pipeline.diagnose.other_forms import OtherForms
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.diagnose.wording import _called, law_warnings
 from cgwm.pipeline.physics import World
@@ -116,6 +117,14 @@ def test_a_wind_goes_with_the_drag_through_which_it_acts(monkeypatch: pytest.Mon
     found = FlightSelection(steps, world_with("ball", values), SimpleNamespace())  # type: ignore[arg-type]
     left = found.without({"linear_drag"})
     assert left.names == ["gravity_tilt"] == [active.effect.name for active in left.world.effects]
+
+
+@pytest.mark.parametrize(("odds", "bic", "mostly"), [(20.0, -50.0, True), (5.0, -50.0, False), (20.0, -500.0, False)])
+def test_beside_a_force_of_another_law_nothing_smaller_is_named(odds: float, bic: float, mostly: bool) -> None:
+    first, second = (evidence(name, delta_bic=b) for name, b in (("length_scale", -200.0), ("gravity_tilt", bic)))
+    found = FlightSelection([SelectionStep((), (one,), True) for one in (first, second)], world_with("ball"), None)
+    form = OtherForms(effect="length_scale", words="", gain=0.0, odds=odds, then="")
+    assert flight_selection._is_mostly_other(found, [form]) == mostly
 
 
 @pytest.mark.parametrize(("fall", "least", "stays"), [(-1.2, -1.0, False), (-0.5, -1.0, True), (1.5, 2.0, False)])
