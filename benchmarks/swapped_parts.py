@@ -8,7 +8,9 @@ Captures are those of `fall_push.py`; each is fitted once, and the ten test moti
 in the true one under our law of contact (the floor), and in mixtures of both: shape, mass (with its centre and
 inertia), the two frictions, and the contact numbers (natural time and damping ratio) of the ground and of the
 fingertip. With `--damping` the fingertip's damping ratio alone is also set to each of some values.
-`error_budget.py` gives the truth to the fit instead, which can then spend it on something else.
+Beside these stands the fitted world with the numbers of contact as the fit to the tracks had them, before their
+refinement with the images. `error_budget.py` gives the truth to the fit instead, which can then spend it on something
+else.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ from cgwm.pipeline.demo.truth_tables import OBJECT
 from cgwm.pipeline.physics.contact_law import ContactLaw
 from cgwm.pipeline.physics.world import Body, World
 from cgwm.schemas import CgwmError, NotConvergedError
+from cgwm.schemas.materials import of_pair
 from contenders.cgwm_default import Cgwm
 from contenders.floor import Floor
 from contenders.training import rolled_out
@@ -66,9 +69,11 @@ def measure(job: Job, work: Work, damping: Sequence[float] = ()) -> dict[str, An
         return vars(job) | {"failed": error.found}
     learned, true = World.from_model(fitted.model), Floor().fit(cell, None).world
     worlds = {"fitted": learned, **{part: mixed(learned, true, (part,)) for part in PARTS}, "floor": true}
+    worlds["as the tracks have it"] = with_numbers(learned, true, fitted.record["parameters_from_tracks"])
     worlds |= {f"damping ratio {ratio:g}": damped(learned, true, ratio) for ratio in damping if true.pair_laws}
     errors = {name: _errors(world, judge) for name, world in worlds.items()}
-    return vars(job) | {"fit": {"parameters": fitted.record["parameters"]}, "errors": errors}
+    fit = {name: fitted.record[name] for name in ("parameters", "parameters_from_tracks", "intervals_95")}
+    return vars(job) | {"fit": fit, "true_friction": judge.truth.contact.friction, "errors": errors}
 
 
 def mixed(learned: World, true: World, parts: Sequence[str]) -> World:
@@ -82,6 +87,21 @@ def mixed(learned: World, true: World, parts: Sequence[str]) -> World:
         mine = learned.pair_laws.get(pair, learned.contact)
         pairs[pair] = _law(mine, law, "fingertip's friction" in parts, "fingertip's numbers" in parts)
     return replace(learned, bodies=tuple(bodies), contact=ground, pair_laws=pairs, ground_material=true.ground_material)
+
+
+def with_numbers(learned: World, true: World, numbers: Mapping[str, float]) -> World:
+    """Return the learned world with other numbers of its contacts and height of its ground, by their names in a fit."""
+    world = mixed(learned, true, ())
+    height = numbers.get("ground_offset_m")
+    if height is not None and world.ground_offset is not None:
+        world = replace(world, ground_offset=torch.full_like(world.ground_offset, height))
+    pairs = {pair: _numbered(law, pair, numbers) for pair, law in world.pair_laws.items()}
+    return replace(world, contact=_numbered(world.contact, None, numbers), pair_laws=pairs)
+
+
+def _numbered(law: Any, pair: tuple[str, str] | None, numbers: Mapping[str, float]) -> ContactLaw:
+    given = {name: numbers.get(of_pair(name, pair)) for name in vars(law)}
+    return replace(law, **{k: torch.full_like(getattr(law, k), v) for k, v in given.items() if v is not None})
 
 
 def damped(learned: World, true: World, ratio: float) -> World:
@@ -117,19 +137,26 @@ def _errors(world: World, judge: Judge) -> list[tuple[float, float]]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the medians of every capture in Markdown: mm / deg."""
+    """Return the medians of every capture in Markdown, mm / deg, after the errors of friction."""
     names = ["fitted", *PARTS, "floor"]
     names += sorted({name for row in rows for name in row.get("errors", {})} - set(names))
-    lines = ["| capture | " + " | ".join(names) + " |", "| --- " * (len(names) + 1) + "|"]
+    lines = ["| capture | friction %, before | " + " | ".join(names) + " |", "| --- " * (len(names) + 2) + "|"]
     for row in rows:
         words = f"{row['task']}, {row['object'].replace('_', '-')}, {row['material']}, {row['engine']}"
         if "failed" in row:
-            lines.append(f"| {words} | failed: {row['failed']} |" + " |" * (len(names) - 1))
+            lines.append(f"| {words} | – | failed: {row['failed']} |" + " |" * (len(names) - 1))
             continue
         middle = {name: np.median(np.array(values), axis=0) for name, values in row["errors"].items()}
         cells = [f"{middle[n][0]:.1f} / {middle[n][1]:.1f}" if n in middle else "–" for n in names]
-        lines.append(f"| {words} | " + " | ".join(cells) + " |")
+        lines.append(f"| {words} | {_friction(row)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _friction(row: dict[str, Any]) -> str:
+    """Return the errors of friction of a fit [%], as it is and before it was refined with images."""
+    found = [row["fit"].get(name, {}).get("friction") for name in ("parameters", "parameters_from_tracks")]
+    true = row.get("true_friction")
+    return ", ".join(f"{100 * (value / true - 1):+.0f}" for value in found if value is not None) if true else "–"
 
 
 def main() -> int:

@@ -60,6 +60,7 @@ class FittedCgwm:
             "seconds_by_step": stage.get("seconds_by_step", {}),
             "image_loss": stage.get("image_loss", {}),
             "pose_tracks": stage.get("pose_tracks", {}),
+            "parameters_from_tracks": stage.get("parameters_from_tracks", {}),
             "warnings": list(file.warnings),
         }
 
