@@ -416,7 +416,7 @@ def _tree_flags(tree: Tree) -> dict[str, int]:
     return {
         "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
         "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy, "LEVELS": tree.levels,
-        "BRANCH_COUNT": len(tree.branches), "COLUMNS": tree.columns,
+        "BRANCH_COUNT": len(tree.branches), "SERIAL": tree.serial, "COLUMNS": tree.columns,
         "FIRST_MOVED": int(bool(tree.kinds) and tree.kinds[0] != FREE_ROOT),
     }  # fmt: skip
 
