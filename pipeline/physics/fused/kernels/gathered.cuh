@@ -153,6 +153,7 @@ __device__ bool part_by_warp(const Problem& problem, const Environment& env, int
     const bool edges = compared && contact_count(p) > sphere_count(a) + sphere_count(b) && !(gap > limit);
     const Hull hull_a = hull_of(problem, env, a), hull_b = hull_of(problem, env, b);
     __syncwarp(FULL);
+    if (lane == 0) found.met_count = 0;
     if (edges && lane == 0) {
         const Mat &R = rotations[a], &Q = rotations[b];
         Mat turn = {R.x.x * Q.x + R.y.x * Q.y + R.z.x * Q.z, R.x.y * Q.x + R.y.y * Q.y + R.z.y * Q.z,
@@ -173,7 +174,9 @@ __device__ bool part_by_warp(const Problem& problem, const Environment& env, int
             for (int n = 0; n < many_b; n++) {
                 Crossing crossing;
                 const Edge second = near_edge(found, hull_b, n);
-                if (surely_lean(first, second, Number(0)) || !cross_edges(first, second, crossing)) continue;
+                if (surely_lean(first, second, Number(OUT_OF_FACE)) || !cross_edges(first, second, crossing)) continue;
+                if (crossing.lean > Number(OUT_OF_FACE)) continue;
+                if (crossing.within && plain(crossing.gap) < limit) found.meet(found.near_a.edge(m), n, crossing);
                 if (crossing.lean > Number(0) || !(plain(crossing.gap) > most)) continue;
                 most = plain(crossing.gap);
                 which = n * many_a + m;
@@ -196,7 +199,9 @@ __device__ bool part_by_warp(const Problem& problem, const Environment& env, int
             gap = greater(gap, exact);
         }
     }
+    __syncwarp(FULL);
     if (lane == 0) {
+        if (found.met_count > MET_ROOM) found.met_count = -1;
         found.on_a = on_a;
         found.on_b = on_b;
         found.gap = gap;
@@ -226,6 +231,9 @@ INLINE void gather(Environment& env, const Contact& c, Real weight, int p) {
     room.weights[place] = weight;
     room.pairs[place] = p;
 }
+
+// The slot of two edges, among those of edges.
+INLINE int slot_of(const Met& met) { return 2 * met.edge + met.leaves; }
 
 // Makes the contact of slot `k` of two bodies, if they touch there.
 __device__ void touch_slot(const Problem& problem, Environment& env, int p, int k, const Mat* rotations,
@@ -303,11 +311,16 @@ INLINE void touch_pair(const Problem& problem, Environment& env, const Lanes& la
         }
         if (mine) touch_slot(problem, env, p, k, rotations, motions, parting, edge);
     }
-    // of edges, only those that are near have contacts
-    const int slots = contact_count(p) - spheres_in_all;
+    // of edges, those that met have contacts, or, where these are more than there is room for, those that are near
+    const int slots = contact_count(p) - spheres_in_all, met = parting.met_count;
+    const int many = slots == 0 ? 0 : met >= 0 ? met : 2 * parting.near_a.many(slots / 2);
     KEEP_LOOP
-    for (int i = lane; slots > 0 && i < 2 * parting.near_a.many(slots / 2); i += WARP) {
-        touch_slot(problem, env, p, spheres_in_all + 2 * parting.near_a.edge(i / 2) + i % 2, rotations, motions, parting, -1);
+    for (int i = lane; i < many; i += WARP) {
+        int slot = met >= 0 ? slot_of(parting.met[i]) : 2 * parting.near_a.edge(i / 2) + i % 2;
+        for (int before = 0; before < (met >= 0 ? i : 0); before++) {
+            if (slot_of(parting.met[before]) == slot) slot = -1;
+        }
+        if (slot >= 0) touch_slot(problem, env, p, spheres_in_all + slot, rotations, motions, parting, -1);
     }
     __syncwarp(FULL);  // before the next pair overwrites how these two part
 }
