@@ -43,6 +43,7 @@ _NAMES = {
     **{f"f{axis}": (f"f{axis}", f"f{axis}_n", f"force_{axis}", f"force_{axis}_n") for axis in "xyz"},
 }
 _UNIT = re.compile(r"^(.*?)[ _]*[(\[_ ](m|cm|mm|in|s|ms|us|ns)[)\]]?$")
+_DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _LENGTHS, _TIMES = ("m", "cm", "mm", "in"), ("s", "ms", "us", "ns")
 
 
@@ -64,6 +65,7 @@ def import_csv(
 
     The first line names the columns, separated by commas, semicolons or tabs. Several spellings are recognised
     (time, t, timestamp; px, x, tx, pos_x; qw, quat_w, ...), and names may end in their unit: `x_mm`, `Time (ms)`.
+    Comments (#) may stand before it, and where no comma separates the columns, one may separate the decimals.
     Lines without a position are gaps. Each file's times begin at zero.
 
     Args:
@@ -107,6 +109,8 @@ class _Header:
     """Index of each column by the quantity in it."""
     units: Units
     """Units from the column names."""
+    decimal_comma: bool = False
+    """Whether a comma may separate the decimals, where it does not separate the columns."""
 
 
 def _left_out_warnings(left_out: Counter[str], files: int) -> tuple[str, ...]:
@@ -130,12 +134,10 @@ def _tracks(
     spin_frame: Literal["world", "body"] | None,
 ) -> dict[str, Track]:
     """Return the tracks of a file, and count its columns that are not read in `left_out`."""
-    text = read_text(path)
-    first, _, _ = text.partition("\n")
-    separator = max(",;\t", key=first.count)
+    text, separator = _without_comments(read_text(path))
     rows = csv_rows(path, text, separator)
-    names = next(rows, (0, []))[1]
-    header = _header(path, names, columns, units)
+    names = next((row for _, row in rows if any(cell.strip() for cell in row)), [])
+    header = replace(_header(path, names, columns, units), decimal_comma=separator != ",")
     if spin_frame is None and _QUATERNION[0] in header.index:  # nothing says along which axes
         header = replace(header, index={key: k for key, k in header.index.items() if key not in _SPIN})
     left_out.update(name.strip() for k, name in enumerate(names) if k not in header.index.values())
@@ -149,6 +151,23 @@ def _tracks(
         track = header.units.track(where, parts.time, parts.position, parts.quat, parts.omega, parts.force)
         tracks[name] = _with_body_spin(track) if spin_frame == "world" else track
     return tracks
+
+
+def _without_comments(text: str) -> tuple[str, str]:
+    """Return a text with its first lines blank where they are comments (#), and what separates its columns.
+
+    The last of them names the columns where the line after it holds as many numbers.
+    """
+    lines = text.split("\n")
+    count = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), 0)
+    separator = max(",;\t", key=lines[count].count)
+    if count:
+        names = lines[count - 1].lstrip().lstrip("#").strip()
+        cells = lines[count].split(separator)
+        numbers = all(_is_number(cell.strip()) or _DECIMAL_COMMA.match(cell.strip()) for cell in cells)
+        named = numbers and len(names.split(separator)) == len(cells)
+        lines[:count] = [""] * (count - 1) + [names if named else ""]
+    return "\n".join(lines), separator
 
 
 @dataclass(frozen=True)
@@ -304,7 +323,8 @@ def _plain(name: str) -> tuple[str, str]:
 def _number(path: Path, line: int, row: list[str], header: _Header, key: str) -> float:
     cell = row[header.index[key]].strip()
     try:
-        number = number_of(cell) if cell or key == "time" else math.nan
+        plain = cell.replace(",", ".") if header.decimal_comma and _DECIMAL_COMMA.match(cell) else cell
+        number = number_of(plain) if cell or key == "time" else math.nan
         if math.isinf(number):
             raise ValueError
     except ValueError:

@@ -152,9 +152,9 @@ class Units:
         if (bad := np.flatnonzero(steps <= 0)).size:
             k = int(bad[0])
             raise InputDataError(
-                f"{where}: time {time[k + 1]:.9g} comes after {time[k]:.9g}.",
+                f"{where}: time {time[k + 1]:.15g} comes after {time[k]:.15g} ({bad.size} of {len(time)} are so).",
                 "times that increase from sample to sample.",
-                "sort the samples and remove duplicates.",
+                "remove the samples that are there twice." if (steps >= 0).all() else "sort the samples by time.",
             )
         step, spread = float(np.median(steps)), float(np.ptp(position, axis=0).max())
         if self.time is None and step >= _SLOWEST_STEP_S:
@@ -162,7 +162,9 @@ class Units:
             raise InputDataError(
                 f"{where}: from sample to sample the time grows by {step:.6g}: hardly seconds.",
                 "seconds, or another unit that is named.",
-                f"add --time-unit {unit} (or, if these are seconds: --time-unit s).",
+                f"add --time-unit {unit} (or, if these are seconds: --time-unit s)."
+                if step != 1
+                else "divide numbers of frames by the frame rate, or add --time-unit ms (if these are seconds: s).",
             )
         if self.length is None and spread > _LONGEST_PATH_M:
             raise InputDataError(

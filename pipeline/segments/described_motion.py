@@ -154,9 +154,11 @@ class _Predicted:
         measured = self.seen.seen.amax(-1) > 0
         nearest = float(torch.where(measured, gap, torch.inf).amin(1).median())
         if nearest == np.inf:
+            gravity = self.world.gravity.flatten()[-3:]
+            up = ", ".join(f"{-float(part) + 0.0:.6g}" for part in gravity / gravity.norm())
             return (
                 "the model has nothing to touch: no ground, and no other body. Add [world] ground to capture.toml: "
-                "ground = { normal = [0, 0, 1], offset_m = 0 }"
+                f"ground = {{ normal = [{up}], offset_m = 0 }}"
             )
         if nearest > LIMITS.near_sizes * self.size_m:
             return (

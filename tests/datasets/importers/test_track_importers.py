@@ -243,8 +243,28 @@ def test_csv_faults(tmp_path: Path) -> None:
     assert "no column 'X'" in said("t,x,y,z\n", columns={"px": "X"})
     assert "'p' is nothing that a column can be" in said("t,x,y,z\n", columns={"p": "x"})
     assert "time 0 comes after 0.1" in said("t,x,y,z\n0.1,1,2,3\n0,1,2,3\n")
+    assert "remove the samples that are there twice" in said("t,x,y,z\n0,1,2,3\n0,1,2,3\n0.1,1,2,3\n")
+    assert "divide numbers of frames by the frame rate" in said("t,x,y,z\n0,1,2,3\n1,1,2,3\n2,1,2,3\n")
+    assert "'1,000,000' is no number" in said("t;x;y;z\n0;1,000,000;2;3\n")
     assert "another norm than 1, the first 2.0000" in said("t,x,y,z,qw,qx,qy,qz\n0,1,2,3,2,0,0,0\n0.1,1,2,3,1,0,0,0\n")
     assert "2 training and 0 test episodes of 1 recordings" in said("t,x,y,z\n0,1,2,3\n0.1,1,2,3\n", n_train=2)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# tracker v3\n\n#\nt;x;y;z\n0;1,5;2;3\n0,1;1,25;2;-3e-1\n",
+        "# t,x,y,z\n0,1.5,2,3\n0.1,1.25,2,-0.3\n",
+        "# tracker\n# t\tx\ty\tz\n0\t1,5\t2\t3\n0,1\t1,25\t2\t-0,3\n",
+    ],
+    ids=["comments", "savetxt", "tabs"],
+)
+def test_comments_and_decimal_commas_are_read(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    import_csv(tmp_path / "a.csv", tmp_path / "out")
+    track = track_of(tmp_path / "out", "a")
+    np.testing.assert_allclose(track.time_s, [0, 0.1])
+    np.testing.assert_allclose(track.position_m, [[1.5, 2, 3], [1.25, 2, -0.3]])
 
 
 def test_milliseconds_and_millimetres_are_not_taken_for_seconds_and_metres(tmp_path: Path) -> None:
