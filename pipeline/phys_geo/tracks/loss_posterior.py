@@ -5,11 +5,13 @@ fitted and have the priors, are no normal distribution, and the curvature at the
 Forces are linear in the losses themselves, so that the likelihood is a normal density in these. With u the change of a
 loss, in any unit, and of the logarithm of the factor, from the best point, information H and slope g of the data there,
 
-    log p = -u' H u / 2 + g' u - sum ((z - m) / s)^2 / 2,
+    log p = -u' H u / 2 + g' u - sum ((z - m) / s)^2 / 2.
 
-of which draws of the normal density, weighted by the priors, are a first sample, and an ensemble of walkers that begin
-there the final one (stretch moves: Goodman and Weare, 2010). An interval reaches between the
-quantiles of the draws, in logarithms; where the data tell all numbers it is that of the curvature.
+The priors are densities of the losses, not of their logarithms: equal weight of all logarithms would draw a loss that
+data tell to within its size to nothing, while equal weight of all losses leaves it where they tell it to be. Draws of
+the normal density, weighted by the priors, are a first sample, and an ensemble of walkers that begin there the final
+one (stretch moves: Goodman and Weare, 2010). An interval reaches between the quantiles of the draws, in logarithms;
+where the data tell all numbers it is that of the curvature.
 """
 
 from __future__ import annotations
@@ -48,15 +50,16 @@ def posterior(
         parameters: Losses and factors of mass, with their priors.
     """
     middle = np.array([p.encode(p.prior[0]) for p in parameters])
-    width = np.array([p.prior[1] for p in parameters])
     low, high = np.array([p.limits for p in parameters]).T
     linear = units > 0
+    width = np.array([p.prior[1] for p in parameters])
 
     def height(z: NDArray[np.float64]) -> NDArray[np.float64]:
         u = np.where(linear, np.exp(z) / np.where(linear, units, 1.0), z) - best
         data = u @ slope - 0.5 * np.einsum("ki,ij,kj->k", u, information, u)
         inside = ((z >= low) & (z <= high)).all(1)
-        return np.where(inside, data - 0.5 * np.square((z - middle) / width).sum(1), -np.inf)
+        prior = z.sum(1, where=linear) - 0.5 * np.square((z - middle) / width).sum(1)
+        return np.where(inside, data + prior, -np.inf)
 
     rng, known = np.random.default_rng(0), np.where(linear, WEAK, 1 / width) ** 2
     precision = information + np.diag(known)
