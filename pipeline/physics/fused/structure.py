@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import product
 
 from ...runtime import kernel_build
 from ..contact_detection import FAR_M, PAIR_SMOOTHING_M
@@ -262,8 +263,9 @@ class Structure:
         """
         wanted = replace(self, lanes=lanes)
         if wanted.gathered:
-            for crowd in CROWDS:
-                found = replace(self, lanes=max(lanes, WARP), crowd=min(crowd, self.contacts))
+            wide = max(lanes, WARP)
+            for crowd, each in product(CROWDS, (wide, *(fewer for fewer in (128, 64, WARP) if fewer < wide))):
+                found = replace(self, lanes=each, crowd=min(crowd, self.contacts))
                 if _block_bytes(found) <= room:
                     return found
             return self.on_lanes(1)

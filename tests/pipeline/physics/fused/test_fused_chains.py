@@ -309,13 +309,13 @@ def test_a_block_has_room_for_as_many_contacts_as_its_memory_holds() -> None:
     world, state, commands = hulled_hand()
     hand = replace(pack(world, state, times(0.01), commands, False).structure, pairs=((1, 2, 144),) * 90)
     most = 227 << 10
-    some = replace(hand, lanes=256, crowd=128).block_bytes
-    found = [hand.on_lanes(lanes, room) for lanes, room in ((8, most), (256, most), (256, some), (256, 8 << 10))]
-    assert [(each.lanes, each.crowd, each.threads) for each in found] == [
-        (32, 256, 32), (256, 256, 256), (256, 128, 256), (1, 0, 32)
-    ]  # fmt: skip
+    some, few = (replace(hand, lanes=32, crowd=crowd).block_bytes for crowd in (256, 128))
+    rooms = ((8, most), (256, most), (256, some), (256, few), (256, 8 << 10))
+    found = [hand.on_lanes(lanes, room) for lanes, room in rooms]
+    assert [each.crowd for each in found] == [256, 256, 256, 128, 0]
+    assert [each.threads for each in found[:2]] == [32, 256] and 32 <= found[2].threads < 256 > found[3].threads
     with pytest.raises(UsageError, match=r"(?s)may have 12960 contacts at once.*--device cpu"):
-        require_room(found[3])
+        require_room(found[4])
 
 
 def test_environments_of_a_block_are_as_many_as_its_memory_holds() -> None:
