@@ -56,6 +56,8 @@ class Segments:
     """Standard deviations of the tracks (position [m], rotation [rad])."""
     noise_model: NoiseModel = WHITE
     """Correlation of the errors in time."""
+    in_short_steps: bool = False
+    """Whether flights take the shortest steps, not those that are exact below the noise of a frame."""
 
     @staticmethod
     def of(
@@ -106,7 +108,7 @@ class Segments:
 
     def in_world(self, world: World) -> Segments:
         """Return the segments in another world, with the step that their kind needs."""
-        return replace(self, world=world_for(self.kind, world, self.noise.position_m))
+        return replace(self, world=world_for(self.kind, world, 0.0 if self.in_short_steps else self.noise.position_m))
 
     def in_states(self, states: Sequence[State]) -> Segments:
         """Return the segments once in each of several states (B), as one batch."""

@@ -70,6 +70,9 @@ def fit_effect_flights(
         if prepared.flight is None:
             return None
         found = refit([prepared.flight], world, names, found.values, ITERATIONS)
+    # an error of the steps is common to all frames, whose number makes the noise small beside it
+    short = replace(found.segments[0], in_short_steps=True)
+    found = refit([short], world, names, found.values, ITERATIONS)
     linear = linearised(found.segments[0], names, found.values)
     prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in names])).to(start).numpy()
     information = linear.information.sum(0).numpy()
