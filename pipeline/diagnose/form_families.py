@@ -22,13 +22,14 @@ from torch import Tensor
 from ..physics.effects.effect import ActiveEffect
 from ..segments.force_fields import FlownMotion, ForceField
 from .coupled_effects import DRAGS
-from .own_tilt import OWN_TILTS
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.forms
 
 UPWARD = ("gravity_scale", "length_scale", "clock_scale")
 """Effects that change the fall, and nothing across it."""
+OWN_TILTS = ("gravity_tilt", "frame_tilt")
+"""Effects across gravity of which each episode can have its own, which flight does not tell apart."""
 FOLLOWS = {
     **dict.fromkeys(DRAGS, ("speed",)),
     "magnus_lift": ("speed", "spin"),

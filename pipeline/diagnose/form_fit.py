@@ -109,7 +109,7 @@ class FormFit:
             columns.append(jacobian[..., size : size + 1] * member)
             last += member.shape[-1]
         joined = torch.cat((*columns, jacobian[..., len(parameters) :]), -1)
-        information, score = _by_episode(flight, projected(flight, rows, joined, last))
+        information, score = by_episode(flight, projected(flight, rows, joined, last))
         own = [k for k, p in enumerate(base) if p.name.partition(".")[0] == active.effect.name]
         rest = [k for k in range(count) if k not in own]
         widths = [parameters[k].prior[1] for k in rest]
@@ -179,7 +179,7 @@ class FormFit:
         return step
 
 
-def _by_episode(flight: Segments, linear: Linear) -> tuple[Array, Array]:
+def by_episode(flight: Segments, linear: Linear) -> tuple[Array, Array]:
     """Return information (E, n, n) and score (E, n) of the episodes of flights."""
     episode = np.unique([item.episode for item in flight.items], return_inverse=True)[1]
     information = np.zeros((episode.max() + 1, *linear.information.shape[1:]))

@@ -21,6 +21,10 @@ therefore as likely with one more effect of the library beside it as without, no
 one of them costs what its numbers do in BIC. Nor need all that is named act: one force of another form may be what two
 effects of the library imitate together, as one that grows with the height is imitated by a scale of lengths and a
 magnet, so that each law is also tried without one of the other named effects, whose numbers it saves.
+
+A tilt of each episode's own follows any force that flights meet differently: a fan on one side of the room pushes each
+throw for another time. Within a flight a tilt is constant, though, and such a force is not. The same forms, across
+gravity, take the place of the tilts, with a value for each episode, of one size before the data, or with one for all.
 """
 
 from __future__ import annotations
@@ -28,21 +32,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from ..physics.effects.registry import FLIGHT_ALIASES
 from ..physics.world import World
 from ..segments.candidates import Candidate, acts_in, admissible, variants_of
-from ..segments.force_fields import FlownMotion
+from ..segments.force_fields import FlownMotion, ForceField
+from ..segments.linearization import derivatives
+from ..segments.segment_fit import projected
 from ..segments.segments import Segments
 from .coupled_effects import DRAGS
 from .form_families import Family, families_of, laws_of, own_field, weights_of
-from .form_fit import FormCost, FormFit, Scales
+from .form_fit import FormCost, FormFit, Scales, by_episode
 from .session_scales import apart, linearize_beside_scales, members, scale_spread
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,19 +161,19 @@ def _compared(
         (cost for groups in tried for group in groups for law in group for cost, _ in law), key=lambda c: c.chi2
     )
     logs = [
-        _log_mean(
+        log_mean(
             [
-                _log_mean([_log_mean([_log(*one, likeliest, fit.count) for one in law]) for law in group])
+                log_mean([log_mean([_log(*one, likeliest, fit.count) for one in law]) for law in group])
                 for group in groups
             ]
         )
         for groups in tried
     ]
-    own = _log_mean(logs[:laws])
+    own = log_mean(logs[:laws])
     half = {words: log - own for words, log in zip(forms, logs[laws:], strict=True)}
     best = max(half, key=lambda one: half[one])
-    together = [_log_mean([half[words] for words in family.forms]) for family in families]
-    odds = 2 * (_log_mean(together, weights_of(families, name)) + math.log(forces))
+    together = [log_mean([half[words] for words in family.forms]) for family in families]
+    odds = 2 * (log_mean(together, weights_of(families, name)) + math.log(forces))
     then = next(family.then for family in families if best in family.forms)
     return OtherForms(effect=name, words=best, gain=2 * half[best], odds=odds, then=then)
 
@@ -192,7 +203,53 @@ def _log(cost: FormCost, more: int, likeliest: FormCost, count: float) -> float:
     return -0.5 * ((cost.chi2 - likeliest.chi2) / likeliest.scatter + more * math.log(count))
 
 
-def _log_mean(values: Sequence[float], weights: Sequence[float] = ()) -> float:
+def log_mean(values: Sequence[float], weights: Sequence[float] = ()) -> float:
     """Return the logarithm of the mean of exponentials, weighted where weights are given."""
     logs = np.log(np.array(weights)) if weights else np.zeros(len(values))
     return float(np.logaddexp.reduce(np.array(values) + logs) - np.logaddexp.reduce(logs))
+
+
+class OwnForm(NamedTuple):
+    """The other form that flights fit best, in place of a tilt of each episode's own."""
+
+    coordinate: str
+    """What the force follows."""
+    odds: float
+    """Twice the logarithm of the odds of all forms against tilts."""
+
+
+def own_form(whole: Segments, world: World, std_m_s2: float) -> OwnForm:
+    """Compare tilts of each episode's own with other forms of a force across gravity.
+
+    Args:
+        whole: Whole flights, with fitted states and without accelerations of their own in the noise.
+        world: The world without effects that push across gravity.
+        std_m_s2: Standard deviation of the accelerations [m/s2].
+    """
+    motion = FlownMotion(whole.in_world(world))
+    level = motion.axes[1].expand(*motion.times_s.shape, 3, 2).clone()
+    own = ForceField(level, torch.zeros_like(level))
+    families = families_of(motion, own, ("gravity_tilt",))
+    fields = [own, *(field for family in families for field in family.forms.values())]
+    parameters, rows, jacobian = derivatives(motion.flight, world, ())
+    states = jacobian[..., len(parameters) :]
+    joined = torch.cat((motion.innovations(ForceField.joined(fields)).to(jacobian), states), -1)
+    count = sum(field.size for field in fields)
+    information, score = by_episode(motion.flight, projected(motion.flight, rows, joined, count))
+    each = [_of_own(information[:, k : k + 2, k : k + 2], score[:, k : k + 2], std_m_s2) for k in range(0, count, 2)]
+    logs = iter(log_mean(both) - each[0][0] for both in each[1:])  # one tilt for all is no tilt of each episode's own
+    found = [[next(logs) for _ in family.forms] for family in families]
+    best = max(range(len(families)), key=lambda k: max(found[k]))
+    return OwnForm(families[best].coordinate, 2 * log_mean([log_mean(one) for one in found]))
+
+
+def _of_own(information: Array, score: Array, std: float) -> tuple[float, float]:
+    """Return the logarithms of the likelihoods, against none, of values of each episode (E, 2) and of one for all."""
+    total = information.sum(0, keepdims=True), score.sum(0, keepdims=True)
+    return _of_values(information, score, std), _of_values(*total, std)
+
+
+def _of_values(information: Array, score: Array, std: float) -> float:
+    """Return the logarithm of the likelihood, against none, of values (n, 2) of one size before the data."""
+    explained = np.einsum("ni,nij,nj->", score, np.linalg.inv(information + np.eye(2) / std**2), score)
+    return 0.5 * float(explained - np.linalg.slogdet(np.eye(2) + std**2 * information)[1].sum())

@@ -26,6 +26,8 @@ from ..segments.segments import Segments
 from ..segments.slow_errors import SlowErrors
 from .effect_selection import SelectionStep
 from .evidence import Evidence
+from .form_families import OWN_TILTS
+from .other_forms import own_form
 from .own_accelerations import OwnAccelerations
 from .rest_tilts import rests_confirm
 from .score_test import ScoreTest, solved
@@ -38,8 +40,6 @@ TILTS = ("gravity_tilt", "frame_tilt", "constant_force", "wind")
 PIECE_S, LONGEST_S = 0.15, 60.0
 """Length [s] of the pieces of flight between which a tilt of an episode's own may not change, half a flight where that
 is less; and one above that of any flight."""
-OWN_TILTS = ("gravity_tilt", "frame_tilt")
-"""Effects of which each episode can have its own, which flight does not tell apart."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,8 @@ def own_tilts(prepared: Prepared, world: World, candidates: Sequence[Candidate],
     """Return what the accelerations of the flights' own are that slow errors have.
 
     A tilt has to be the same in all pieces of an episode's flights (a gust pushes in some of them), to predict each
-    piece from the others, and to follow nothing in the motion; or the bodies have to lie on the ground as tilted.
+    piece from the others, to be likelier than other forms of a force (`other_forms`), and to follow nothing in the
+    motion; or the bodies have to lie on the ground as tilted.
 
     Args:
         prepared: The episodes, without slow errors as part of their noise.
@@ -90,7 +91,10 @@ def _told(prepared: Prepared, world: World, name: str, whole: Segments, slow: Sl
     by_piece = OwnAccelerations.of(residual_wrenches(pieces.in_world(_bare(world))), level)
     if float(by_piece.held_out_gains(std_m_s2).sum()) <= 0:
         return OwnTilts("none")
-    return _kind(accelerations, std_m_s2 / gravity)
+    form = own_form(whole, _bare(world), std_m_s2)
+    if form.odds > -LIMITS.form_odds:
+        return OwnTilts("force", form.coordinate)
+    return _kind(accelerations, std_m_s2 / gravity, form.odds < LIMITS.form_odds)
 
 
 def _median_length_s(whole: Segments) -> float:
@@ -99,11 +103,17 @@ def _median_length_s(whole: Segments) -> float:
     return float(np.median([float(times[k, n - 1] - times[k, 0]) for k, n in enumerate(whole.lengths)]))
 
 
-def _kind(accelerations: OwnAccelerations, std_rad: float) -> OwnTilts:
-    """Return what accelerations are that last for an episode each, from the size [rad] that they have as tilts."""
+def _kind(accelerations: OwnAccelerations, std_rad: float, constant: bool) -> OwnTilts:
+    """Return what accelerations are that last for an episode each.
+
+    Args:
+        accelerations: The accelerations of episodes.
+        std_rad: The size that they have as tilts [rad].
+        constant: Whether flights tell them from forces that act during a part of each flight.
+    """
     if (law := accelerations.law()) is not None:
         return OwnTilts("force", law)
-    if len(np.unique(accelerations.episode)) >= LIMITS.own_episodes:
+    if constant and len(np.unique(accelerations.episode)) >= LIMITS.own_episodes:
         return OwnTilts("tilts")
     return OwnTilts("levelling") if std_rad < LIMITS.levelling_rad else OwnTilts("force", "episode")
 

@@ -10,7 +10,7 @@ import pytest
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose import wording
 from cgwm.pipeline.diagnose.form_families import Family, weights_of
-from cgwm.pipeline.diagnose.other_forms import OtherForms, _forces, _log_mean, other_forms
+from cgwm.pipeline.diagnose.other_forms import OtherForms, _forces, log_mean, other_forms, own_form
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.effect import BodyMotion, Effect, EffectParameter, Values, Wrench
 from cgwm.pipeline.physics.world import World
@@ -63,6 +63,19 @@ class ForceByHeight(Effect):
     def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
         height = (motion.com * motion.up).sum(-1, keepdim=True)
         return Wrench(force=motion.mass[:, None] * values["f"][:, None] * height * motion.up)
+
+
+class Fan(Effect):
+    """a = f along y where x > 0, which is in no library."""
+
+    name = "fan"
+    summary = formula = reveals = source = "a = f e_y where x > 0"
+    parameters = (EffectParameter(name="f", unit="m/s2", scale=0.1, limit=5.0),)
+    phase = "flight"
+
+    def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
+        on = (motion.com[:, :1] > 0).to(motion.com) * motion.com.new_tensor([0.0, 1.0, 0.0])
+        return Wrench(force=motion.mass[:, None] * values["f"][:, None] * on)
 
 
 def late(time_s: Array) -> Array:
@@ -140,7 +153,7 @@ def test_forms_that_differ_in_what_a_law_follows_are_as_likely_as_all_others() -
     assert weights_of(families, "linear_drag") == [1, 1, 1, 5, 1, 1]
     assert weights_of(families, "magnus_lift") == [1, 1, 1, 2, 2, 1]
     assert weights_of(families, "gravity_tilt") == [1] * 6
-    assert _log_mean([0.0, np.log(3.0)], [1.0, 3.0]) == pytest.approx(np.log(2.5))
+    assert log_mean([0.0, np.log(3.0)], [1.0, 3.0]) == pytest.approx(np.log(2.5))
     library = [Candidate(name, load_effect(name)) for name in (*LIBRARY, "length_scale", "clock_scale")]
     assert _forces(("gravity_scale", "length_scale", "clock_scale"), library) == pytest.approx(1 / 3)
     assert _forces(("length_scale",), library) == 1  # a scale that sets in is a force all the same
@@ -172,6 +185,22 @@ def test_the_sentence_says_in_which_other_form_a_force_comes_near(gain: float, o
     form = OtherForms(effect="wind", words="the same force times x", gain=gain, odds=odds, then="go on")
     findings: Any = SimpleNamespace(flight=SimpleNamespace(others=[form]))
     assert wording._nearest(findings) == words
+
+
+def test_a_fan_on_one_side_is_no_tilt_of_each_episode() -> None:
+    ball, rng = world_with("ball"), np.random.default_rng(0)
+    fan = replace(ball, effects=(ActiveEffect.of(Fan(), {"f": 0.6}, ball.gravity[0, :1]),))
+    tilts = [
+        world_with("ball", {"gravity_tilt": dict(zip(("tilt_x", "tilt_y"), rng.normal(0, 0.04, 2), strict=True))})
+        for _ in range(6)
+    ]
+    odds = []
+    each = [tosses(world, k, 1, 0.5, 60.0, NOISE, (1.2, 1.4))[0][1] for k, world in enumerate(tilts)]
+    for data in (tosses(fan, 1, 6, 0.5, 60.0, NOISE, (1.2, 1.4)), [(f"{k}", one) for k, one in enumerate(each)]):
+        whole = prepare(ball, data, NOISE).pieces(ball, 60.0)
+        assert whole is not None
+        odds.append(own_form(whole, ball, 0.4).odds)
+    assert odds[0] > 6 and odds[1] < -6
 
 
 def test_what_is_no_force_has_no_other_form() -> None:
