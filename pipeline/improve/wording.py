@@ -50,7 +50,8 @@ def sentence(ladder: Ladder, test: ImproveTest | None) -> str:
                     f"On test episodes the {name} goes from {ratio.before * scale:.3g} to "
                     f"{ratio.after * scale:.3g} {unit} (medians; {ratio_words(ratio)})."
                 )
-    return " ".join([*words, why_ended(ladder)])
+    worse = [] if test is None else worse_words(test)[-1:]
+    return " ".join([*words, *worse, why_ended(ladder)])
 
 
 def _decided(ladder: Ladder) -> set[str]:
@@ -104,7 +105,9 @@ def warnings_of(ladder: Ladder, test: ImproveTest | None, folds: Sequence[Sequen
         )
     if test is None:
         found.append("there is no split 'test' beside these episodes: no error here is of episodes without influence.")
-    elif test.episodes < LEAST_EPISODES:
+    else:
+        found += worse_words(test)
+    if test is not None and test.episodes < LEAST_EPISODES:
         found.append(f"the split 'test' has {test.episodes} episodes: few to judge a model by.")
     found += [
         f"{', '.join(trial.effects)} was added although the diagnosis does not name it: it describes the motion, and "
@@ -117,6 +120,30 @@ def warnings_of(ladder: Ladder, test: ImproveTest | None, folds: Sequence[Sequen
     found += [f"{', '.join(t.effects)} could not be fitted: {t.failure}" for t in failed]
     found += [text for step in ladder.steps[:1] for text in step.warnings]
     return tuple(dict.fromkeys(found))
+
+
+def worse_words(test: ImproveTest) -> list[str]:
+    """Return which models predict the test episodes worse than the one before, beyond chance; empty for none."""
+    found = []
+    for step in test.steps:
+        ratios = {
+            "prediction error in flight": step.flight,
+            "prediction error in contact": step.contact,
+            "open-loop error": step.translation_error_m,
+        }
+        worse = [
+            f"the {name} is {ratio.ratio:.2g} times as large (95 % {ratio.interval_95[0]:.2g} to "
+            f"{ratio.interval_95[1]:.2g})"
+            for name, ratio in ratios.items()
+            if ratio is not None and ratio.interval_95 is not None and ratio.interval_95[0] > 1 + LEAST_FALL
+        ]
+        if worse:
+            found.append(
+                f"{step.model} predicts the test episodes worse than {step.than}, beyond chance: {listed(worse)}. What "
+                "was added helps in the episodes that it was chosen by, and not in others: use "
+                f"{step.than}, or record more motions."
+            )
+    return found
 
 
 def not_added_words(step: ImproveStep) -> list[str]:

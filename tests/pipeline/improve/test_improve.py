@@ -20,7 +20,7 @@ from cgwm.pipeline.improve.ladder import Climb, helps
 from cgwm.pipeline.improve.ladder_files import LadderFiles
 from cgwm.pipeline.improve.page import ladder_html
 from cgwm.pipeline.improve.proposals import Proposal, proposals_of
-from cgwm.pipeline.improve.wording import remaining_words, share_words
+from cgwm.pipeline.improve.wording import remaining_words, share_words, worse_words
 from cgwm.pipeline.phys_geo.effects.requested_effects import with_effects
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.validate import validate
@@ -30,6 +30,8 @@ from cgwm.schemas import (
     ImproveConfig,
     ImproveResult,
     ImproveStep,
+    ImproveTest,
+    ImproveTestStep,
     ImproveTrial,
     InputDataError,
     LawTerm,
@@ -324,3 +326,13 @@ def test_hidden_drag_is_added_and_test_errors_fall_in_the_same_ladder_after_an_i
         assert json.loads(CliRunner().invoke(app, again).stdout) == result
     assert CliRunner().invoke(app, [*words, "--steps", "1"]).exit_code == 2
     assert (tmp_path / "ladder" / "improve.json").read_bytes() == kept
+
+
+@pytest.mark.parametrize(("low", "said"), [(5.7, True), (0.9, False)])
+def test_a_model_that_is_worse_on_the_test_episodes_is_said(low: float, said: bool) -> None:
+    near = ErrorRatio(episodes=3, better=3, before=2.1, after=2.0, ratio=0.96, interval_95=(0.9, 1.01))
+    far = ErrorRatio(episodes=3, better=0, before=0.015, after=0.11, ratio=7.3, interval_95=(low, 9.4))
+    step = ImproveTestStep(model="m1", than="m0", contact=near, translation_error_m=far)
+    words = worse_words(ImproveTest(split="test", episodes=3, verdict="", models=(), steps=(step,)))
+    assert len(words) == said
+    assert not said or ("m1 predicts the test episodes worse than m0" in words[0] and "7.3 times" in words[0])
