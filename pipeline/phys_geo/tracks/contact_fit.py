@@ -168,7 +168,7 @@ def _found(
     elif forces:
         note("phys-geo: measured forces")
         estimate, told = with_forces(ready.world, estimate, forces, batch.observations, batch.start_cov)
-        record = replace(record, forces=told)
+        record = replace(record, forces=told | {"through_law": bool(ready.world.chains)})
     estimate = estimate.without([p.name for p in gap_parameters(ready.world)])
     return physics_fit(known.world, earlier.kept_in(known.world, estimate), data.noise, record)
 

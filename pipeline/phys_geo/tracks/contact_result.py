@@ -257,6 +257,13 @@ def _force_warnings(told: Mapping[str, Any]) -> list[str]:
             "not those on its sensor, in N and along the world's axes, and that nothing else touches the bodies."
         ]
     found = []
+    if told.get("through_law"):
+        found.append(
+            "the measured forces are not all that drives these jointed bodies, or their root is free: they are "
+            "compared through the contact law, in which path and shape of what pushes count as exact. Estimates may "
+            "be off by more than their intervals; a fixed root, and driven bodies that all carry forces and are all "
+            "that touches the links, would tell losses by momentum."
+        )
     if told["apart"]:
         found.append(
             f"the measured forces on short and on long intervals ask for different values of {listed(told['apart'])}, "

@@ -283,6 +283,10 @@ def told(**changes: Any) -> dict[str, Any]:
     [
         (told(), None),
         (told(used=False, unexplained=1.02), "the measured forces are not used: the model's differ from them by 102 %"),
+        (
+            told(through_law=True),
+            "the measured forces are not all that drives these jointed bodies, or their root is free",
+        ),
         (told(apart=["contact_time_s"]), "on short and on long intervals ask for different values of contact_time_s"),
         (told(misfit=9.0, described=False, information_over=90.0), "by 3 times their noise on short intervals"),
         (told(information_over=9.0), "intervals are 3 times as wide as the noise alone would make them"),
