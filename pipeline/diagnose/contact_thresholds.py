@@ -50,8 +50,8 @@ class SlidingThresholds:
     many_parameters: int = threshold(
         4,
         "parameters",
-        "`score_sure` does not apply to an effect with more, nor is it a rival of one with `few_parameters` that "
-        "explains more: a friction map can fit almost anything",
+        "`score_sure` does not apply to an effect with more, nor is it a rival of one with `few_parameters` whose "
+        "score is higher by `misled`: a friction map can fit almost anything",
     )
     gain_t: float = threshold(
         1.0,

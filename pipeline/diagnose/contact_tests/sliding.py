@@ -97,7 +97,7 @@ class SlidingTest(ContactTest):
     def outdone(self, best: Evidence, one: Evidence) -> bool:
         """Return whether an effect that can fit almost anything fits less than the best one, which has few numbers."""
         few, many = (len(e.candidate.effect.parameters) for e in (best, one))
-        fits = one.test.statistic > best.test.statistic - self.limits.lead
+        fits = one.score > best.score - self.limits.misled
         return few <= self.limits.few_parameters and many > self.limits.many_parameters and not fits
 
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
