@@ -92,6 +92,7 @@ SEGMENT_NUMERICS = {
     "length of a warning": ("prepare.NAMED",),
     "end of a descent": (
         "first_contact_fit.ITERATIONS",
+        "first_contact_fit.FINAL_ITERATIONS, FINAL_TOLERANCE",
         "impact_fit.ITERATIONS, FALL",
         "input_checks.ENVELOPE_ITERATIONS",
         "mixed_model.ROUNDS",
