@@ -80,6 +80,9 @@ NOTED = ((0.0, 1.0, 5.0), (0.5, 0.5, 1.5), (0.0, 1.0, 5.0))
 that samples are, 0 for samples and 1 for means, and of the offset of the sensor's zero, in its standard deviation."""
 FLAT = 0.1
 """Information of the prior of a loss in a descent, in its unit, as a root: draws have the real one."""
+MOST_MASS_ERROR = 0.1
+"""Standard error of the factor of mass from which on it is not observable: where no push accelerates the body for many
+samples, hits alone tell it, and impulses between samples are not known that well (1.8 for 1 with an error of 0.24)."""
 MOST_CORRELATION = 0.98
 """Largest correlation of neighbouring residuals that is believed."""
 
@@ -500,6 +503,11 @@ def _fitted(data: _Data) -> DrivenFit:
     own, slope = _without_noted(information, slopes.sum(0) / record["information_over"], best, centre, known, count)
     values, covariance = posterior(best.shared[:count].numpy(), units, own, slope, data.parameters)
     wider = _scatter(information, slopes / record["information_over"], np.diag(known.numpy()))[:count]
+    covariance = covariance * np.outer(wider, wider)
+    if covariance[-1, -1] > MOST_MASS_ERROR**2:
+        mass = data.parameters[-1]
+        values[-1], covariance[-1], covariance[:, -1] = mass.encode(mass.prior[0]), 0.0, 0.0
+        covariance[-1, -1] = mass.prior[1] ** 2
     record |= {
         "episodes": len(data.part),
         "frames": int(data.tracks.shown.sum()),
@@ -514,7 +522,7 @@ def _fitted(data: _Data) -> DrivenFit:
     return DrivenFit(
         parameters=data.parameters,
         values=values,
-        covariance=covariance * np.outer(wider, wider),
+        covariance=covariance,
         pressed=_pressed(data),
         record=record,
     )
