@@ -8,15 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .execution import Emit, loading
-from .options import (
-    AcceptUnits,
-    AnyDevice,
-    Overwrite,
-    TrustEffects,
-    require_models_first,
-    require_warmup,
-    trust,
-)
+from .options import AcceptUnits, AnyDevice, Overwrite, TrustEffects, require_models_first, require_warmup, trust
 from .verb import verb
 
 if TYPE_CHECKING:

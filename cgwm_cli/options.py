@@ -69,13 +69,12 @@ def require_models_first(verb: str, models: Sequence[Path], capture: Path) -> No
     """Refuse a capture among the models that has been given before the capture, and say which order is meant."""
     from ..datasets.io.kinds import kind_of
 
-    given = [*models, capture]
     swapped = [path for path in models if kind_of(path) == "capture"]
     if not swapped or kind_of(capture) == "capture":
         return
     from ..schemas import UsageError
 
-    right = " ".join(str(path) for path in (*(path for path in given if path not in swapped), swapped[0]))
+    right = " ".join(map(str, (*(path for path in models if path not in swapped), capture, swapped[0])))
     raise UsageError(
         f"{swapped[0]} is a capture, and {capture} is none: the capture comes last.",
         f"cgwm {verb} MODEL{'...' if verb == 'compare' else ''} CAPTURE.",
