@@ -44,11 +44,9 @@ tracks' noise. Mainly their ratio matters; the residuals are weighted robustly, 
 between episodes."""
 MAX_WINDOWS = 100
 """Maximum number of windows, which determines second moments of mass within 2 %."""
-ITERATIONS = 16
-"""Maximum number of steps of a fit that only compares or starts."""
-FINAL_ITERATIONS, FINAL_TOLERANCE = 48, 1e-3
-"""The same for estimates that are reported or decide what is fitted, and the relative fall of the cost below which they
-have converged: states at impacts settle slowly (12 and 100 tosses of a real cube need 32 and 38 steps)."""
+ITERATIONS, TOLERANCE = 48, 1e-3
+"""Maximum number of steps of a fit, and the relative fall of the cost below which it has converged: states at impacts
+settle slowly (12 and 100 tosses of a real cube need 32 and 38 steps)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,9 +100,7 @@ def fit_first_contacts(
     names = [parameter for parameter, _ in start]
     residuals = window_residuals(world, episodes, names, noise, None if whole_flight else LEAD_FRAMES, after_s)
     coordinates = torch.tensor([parameter.encode(value) for parameter, value in start]).to(world.gravity)
-    solution = solved_windows(
-        residuals, coordinates, None, _prior(names, count, world.gravity), FINAL_ITERATIONS, FINAL_TOLERANCE
-    )
+    solution = solved_windows(residuals, coordinates, None, _prior(names, count, world.gravity))
     covariance = _covariance(solution, residuals)
     std_errors = np.sqrt(np.diag(covariance))[:count]
     found, coordinates = names[:count], solution.shared[:count]
@@ -153,8 +149,7 @@ def solved_windows(
     shared: Tensor,
     states: Tensor | None,
     shared_prior: tuple[Tensor, Tensor],
-    iterations: int,
-    tolerance: float = 1e-4,
+    iterations: int = ITERATIONS,
 ) -> Solution:
     """Return the robust fit of parameters and the windows' states; with 0 iterations, the linearization at the start.
 
@@ -164,7 +159,6 @@ def solved_windows(
         states: Start of the changes of the states, shape (B, S); None for 0.
         shared_prior: Centre (P,) and information (P,) of the prior on the parameters.
         iterations: Maximum number of steps.
-        tolerance: Relative fall of the cost below which the fit has converged.
 
     Raises:
         NotConvergedError: If the rollouts diverge at the start.
@@ -179,7 +173,7 @@ def solved_windows(
         torch.tensor([parameter.limits for parameter in residuals.parameters]).to(shared),
         robust_scale=ROBUST_SCALE,
         iterations=iterations,
-        tolerance=tolerance,
+        tolerance=TOLERANCE,
         prior_information=state_prior(len(seen.free)),
         shared_prior=shared_prior,
     )

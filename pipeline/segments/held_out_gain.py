@@ -18,14 +18,7 @@ from ..optimization.tails import student_quantile
 from ..physics.parameters import Parameter
 from ..physics.world import World
 from ..trajectories.track_noise import Noise
-from .first_contact_fit import (
-    AFTER_S,
-    FINAL_ITERATIONS,
-    FINAL_TOLERANCE,
-    error_factor,
-    solved_windows,
-    window_residuals,
-)
+from .first_contact_fit import AFTER_S, error_factor, solved_windows, window_residuals
 from .thresholds import SEGMENT_THRESHOLDS
 
 Array = NDArray[np.float64]
@@ -115,7 +108,7 @@ class ContactLinearization:
         count = len(base)
         residuals = window_residuals(world, episodes, names[:count], noise, None, AFTER_S)
         prior = (centre[:count], held[:count])
-        fitted = solved_windows(residuals, coordinates[:count], None, prior, FINAL_ITERATIONS, FINAL_TOLERANCE)
+        fitted = solved_windows(residuals, coordinates[:count], None, prior)
         factor, _ = error_factor(residuals, fitted)
         start = torch.cat([fitted.shared, coordinates[count:]])
         wider = window_residuals(world, episodes, names, noise, None, AFTER_S)

@@ -33,7 +33,7 @@ from ..trajectories.initial_state import flight_frames
 from ..trajectories.observations import Observations
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, state_prior
 from ..trajectories.track_noise import MAD_TO_STD, Noise
-from .first_contact_fit import ITERATIONS, MODEL_ERROR, EffectEstimate, windows_of
+from .first_contact_fit import MODEL_ERROR, EffectEstimate, windows_of
 from .fitted_parameters import fitted_parameter
 from .group_parameters import group_of, group_parameters, with_known_groups
 from .mixed_model import Array, GroupLayout, GroupPosterior, GroupPrior, posterior
@@ -41,8 +41,8 @@ from .segments import PARAMETER_STEP
 
 REST_S = 0.1
 """Length [s] of the window at the end of an episode, where a body at rest shows the ground's height and tilt."""
-FIRST_ITERATIONS = 6
-"""Steps of the first descent, which measures how large residuals are."""
+FIRST_ITERATIONS, ITERATIONS = 6, 16
+"""Steps of the first descent, which measures how large residuals are, and of the second one."""
 STATE_INFORMATION = 1e-4
 """Weight of the prior on states relative to the usual one: the start of a long fall is far from the line through its
 first frames."""

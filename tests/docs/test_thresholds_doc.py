@@ -91,12 +91,11 @@ NUMERICS = {
 SEGMENT_NUMERICS = {
     "length of a warning": ("prepare.NAMED",),
     "end of a descent": (
-        "first_contact_fit.ITERATIONS",
-        "first_contact_fit.FINAL_ITERATIONS, FINAL_TOLERANCE",
+        "first_contact_fit.ITERATIONS, TOLERANCE",
         "impact_fit.ITERATIONS, FALL",
         "input_checks.ENVELOPE_ITERATIONS",
         "mixed_model.ROUNDS",
-        "random_effects.FIRST_ITERATIONS",
+        "random_effects.FIRST_ITERATIONS, ITERATIONS",
         "segment_fit.ITERATIONS",
         "segment_fit.FALL",
         "segment_fit.FALL_SHARE",
