@@ -326,7 +326,7 @@ def _impulse_variance(
     pushes: Mapping[str, Pushes],
 ) -> Tensor:
     """Return the variance (E, T - 1, J) of the mean generalised force on intervals that samples do not tell."""
-    balance, shape = tracks.balance(), tracks.values.shape
+    balance, shape = tracks.balance, tracks.values.shape
     mass = balance.mass.diagonal(dim1=-2, dim2=-1).unflatten(0, shape[:2])[:, :-1]
     variance = torch.zeros_like(mass)
     for name, push in pushes.items():
@@ -356,7 +356,7 @@ def _senses(tracks: JointTracks, pushes: Sequence[Pushes], grid: Grid) -> tuple[
     The latter is the root of the mean square (J,) of the generalised force. A joint moves for sure where it is faster
     than the errors of its speed and than what such a force takes from it in an interval.
     """
-    balance, shape = tracks.balance(), tracks.values.shape
+    balance, shape = tracks.balance, tracks.values.shape
     total = sum((push.at_frames(balance, tracks, grid) for push in pushes), torch.zeros(shape).to(tracks.values))
     acts = tracks.shown[..., None] & (total != 0)
     size = ((total * acts).square().sum((0, 1)) / acts.sum((0, 1)).clamp_min(1)).sqrt().clamp_min(1e-9)
@@ -418,7 +418,7 @@ def _root(information: Tensor) -> Tensor:
 def _first_losses(data: _Data) -> NDArray[np.float64]:
     """Return a first guess (P,): losses by the change of momentum between frames that move, 1 for factors."""
     tracks, driven = data.tracks, data.driven
-    balance, shape = tracks.balance(), tracks.values.shape
+    balance, shape = tracks.balance, tracks.values.shape
     total = sum((p.at_frames(balance, tracks, driven.grid) for p in driven.pushes), torch.zeros_like(tracks.values))
     total = total - balance.bias.unflatten(0, shape[:2])
     mass = balance.mass.unflatten(0, shape[:2])[:, 1:]
@@ -444,7 +444,7 @@ def _pressed(data: _Data) -> list[Pressed]:
     """Return what forces tell of each driven body and the link that it pushes."""
     found, tracks, pushed = [], data.tracks, data.pushed
     fitted_gaps = {p.name for p in gap_parameters(tracks.world)}
-    balance, names = tracks.balance(), tracks.world.body_names
+    balance, names = tracks.balance, tracks.world.body_names
     driven = [name for name in names if any(name in one.std_n for one in pushed)]
     for name, push in zip(driven, data.driven.pushes, strict=True):
         seen = [(e, t, one.std_n[name]) for e, one in enumerate(pushed) if (t := one.force(name)) is not None]

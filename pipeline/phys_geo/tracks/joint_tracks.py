@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -76,8 +77,9 @@ class JointTracks:
         speeds, std = _speeds(self.times_s, self.values, self.information, self.shown, intervals)
         return replace(self, speeds=speeds, speed_std=std)
 
+    @cached_property
     def balance(self) -> Balance:
-        """Return the terms of the equation of motion at rest at all frames (E T)."""
+        """The terms of the equation of motion at rest at all frames (E T)."""
         return balance_at(self.world, self.chain, self.root, self.values.flatten(0, 1))
 
 

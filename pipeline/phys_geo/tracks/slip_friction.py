@@ -158,7 +158,7 @@ def _slips(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the speed (K, 3) of a driven body relative to a link at points, and the error (K,) of a component."""
     at = torch.as_tensor(shown)
-    balance = tracks.balance()
+    balance = tracks.balance
     size = tracks.values.shape[:2]
     rows = balance.rows[:, link].unflatten(0, size)[episode, at].numpy()
     origin = balance.origin[:, link].unflatten(0, size)[episode, at].numpy()
