@@ -23,7 +23,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from cgwm.pipeline.fit import fit
-from joints import COLUMNS, HEAD, print_found, write_tracks
+from joints import COLUMNS, HEAD, force_of_finger, print_found, write_tracks
 from scipy.spatial.transform import Rotation
 
 HALF_M, CASE_M, RADIUS_M = (0.15, 0.15, 0.05), 0.3, 0.01
@@ -169,18 +169,14 @@ def in_mujoco(setting: Setting, push: Push) -> Motion:
         <geom type="box" size="{half}" mass="0"/>
         <inertial pos="0 0 0" mass="{setting.mass_kg}" diaginertia="0.02 0.02 0.02"/></body>
       </worldbody></mujoco>""")
-    data, wrench, rows, exerted = mujoco.MjData(model), np.zeros(6), [], []
+    data, rows, exerted = mujoco.MjData(model), [], []
     every = round(1 / setting.rate_hz / MUJOCO_STEP_S)
     for step in range(round((push.time_s + REST_S) / MUJOCO_STEP_S) + 1):
         way, speed, _ = push.path(step * MUJOCO_STEP_S)
         for joint, share in (("x", 1.0), ("y", setting.sliding)):
             data.joint(joint).qpos[0], data.joint(joint).qvel[0] = share * way, share * speed
         mujoco.mj_forward(model, data)
-        force = np.zeros(3)
-        for contact in range(data.ncon):
-            mujoco.mj_contactForce(model, data, contact, wrench)
-            force += data.contact[contact].frame.reshape(3, 3).T @ wrench[:3]  # from the finger, the first geom
-        exerted.append(force)
+        exerted.append(force_of_finger(model, data))
         if step % every == 0:
             mean = np.mean(exerted[-every:], 0)
             rows.append((data.time, data.joint("rail").qpos[0], data.body("finger").xpos.copy(), mean))

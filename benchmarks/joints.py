@@ -107,19 +107,24 @@ def door(rng: np.random.Generator) -> list[str]:
     return found.rows
 
 
+def force_of_finger(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Return the force (3,) [N] in the world frame that a finger, the first geom of all contacts, exerts."""
+    force, wrench = np.zeros(3), np.zeros(6)
+    for contact in range(data.ncon):
+        mujoco.mj_contactForce(model, data, contact, wrench)
+        force += data.contact[contact].frame.reshape(3, 3).T @ wrench[:3]
+    return force
+
+
 def drawer(rng: np.random.Generator) -> list[str]:
     """Return the track of a drawer that a finger pushes by some centimetres, at one speed."""
     model = mujoco.MjModel.from_xml_string(DRAWER)
     data, found = mujoco.MjData(model), Recorder(rng, True)
-    data.joint("rail").qpos[0], data.joint("finger").qvel[0], wrench = 0.15, -rng.uniform(0.03, 0.25), np.zeros(6)
+    data.joint("rail").qpos[0], data.joint("finger").qvel[0] = 0.15, -rng.uniform(0.03, 0.25)
     exerted: list[np.ndarray] = []
     for step in range(round(0.9 / STEP_S) + 1):
         mujoco.mj_forward(model, data)
-        force = np.zeros(3)
-        for contact in range(data.ncon):
-            mujoco.mj_contactForce(model, data, contact, wrench)
-            force += data.contact[contact].frame.reshape(3, 3).T @ wrench[:3]  # from the finger, the first geom
-        exerted.append(force)
+        exerted.append(force_of_finger(model, data))
         if step % EVERY == 0:
             found.pose(data, "case", False)
             found.pose(data, "drawer", True)
