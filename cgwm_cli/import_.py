@@ -24,7 +24,7 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
     "balldrops": ("only",),
     "pushes": ("only", *_SPLITS),
     "elbow": _SPLITS,
-    "csv": ("columns", "length_unit", "time_unit", "spin_frame", *_TRACKS),
+    "csv": ("columns", "length_unit", "time_unit", "frame_rate", "euler", "angle_unit", "spin_frame", *_TRACKS),
     "tum": ("length_unit", "time_unit", *_TRACKS),
     "hdf5": ("columns", "length_unit", "time_unit", *_TRACKS),
     "rosbag": ("topic", *_TRACKS),
@@ -117,7 +117,8 @@ def import_capture(
         typer.Option(
             "--columns",
             metavar="KEY=NAME,...",
-            help="csv: names of columns that are not recognised (time, body, px .. pz, qw .. qz, wx .. wz); "
+            help="csv: names of columns that are not recognised (time, body, px .. pz, qw .. qz, roll, pitch, yaw, "
+            "wx .. wz); "
             "hdf5: names of datasets (time, position, quat_wxyz, quat_xyzw).",
             show_default=False,
         ),
@@ -133,6 +134,29 @@ def import_capture(
     time_unit: Annotated[
         Literal["s", "ms", "us", "ns"] | None,
         typer.Option("--time-unit", help="csv, tum, hdf5: unit of times (s).", show_default=False),
+    ] = None,
+    frame_rate: Annotated[
+        float | None,
+        typer.Option(
+            "--frame-rate",
+            metavar="HZ",
+            help="csv: the column of times counts frames (or is called frame, or is missing), at this rate.",
+            show_default=False,
+        ),
+    ] = None,
+    euler: Annotated[
+        str | None,
+        typer.Option(
+            "--euler",
+            metavar="ORDER",
+            help="csv: read roll, pitch, yaw (angles about x, y, z); their turns, first to last, about fixed axes "
+            "(xyz: roll, pitch, yaw of robots) or about the body's (XYZ).",
+            show_default=False,
+        ),
+    ] = None,
+    angle_unit: Annotated[
+        Literal["deg", "rad"] | None,
+        typer.Option("--angle-unit", help="csv: unit of these angles, if the names do not say it.", show_default=False),
     ] = None,
     spin_frame: Annotated[
         Literal["world", "body"] | None,
@@ -159,7 +183,7 @@ def import_capture(
     """Convert recordings in another format to a capture."""
     given = {"train": train, "test": test, "seed": seed, "only": only, "columns": columns, "body": body, "up": up}
     given |= {"length_unit": length_unit, "time_unit": time_unit, "topic": topic, "spin_frame": spin_frame}
-    given["photos"] = photos
+    given |= {"photos": photos, "frame_rate": frame_rate, "euler": euler, "angle_unit": angle_unit}
     words = {name: value for name, value in given.items() if value is not None}
     refuse_foreign(words, _OPTIONS[format_], format_, "omit it.")
     emit(_imported(format_, source, out, words, overwrite), _summary)
@@ -169,8 +193,9 @@ def _imported(format_: str, source: Path, out: Path, given: dict[str, Any], over
     """Import with the given options and the importer's defaults for all others."""
     from .. import datasets
 
-    renamed = {"train": "n_train", "test": "n_test"}
-    words = {renamed.get(name, name): value for name, value in given.items() if not name.endswith("_unit")}
+    renamed = {"train": "n_train", "test": "n_test", "frame_rate": "frame_rate_hz"}
+    units = ("length_unit", "time_unit")
+    words = {renamed.get(name, name): value for name, value in given.items() if name not in units}
     if "columns" in words:
         words["columns"] = _named(words["columns"])
     if "length_unit" in _OPTIONS[format_]:

@@ -20,31 +20,12 @@ from ..capture.tracks import Track
 from ..io.atomic import new_directory
 from ..io.cells import csv_rows, number_of, shown
 from ..io.outputs import reads
+from .csv_header import COLUMNS, EULER, FORCE, QUATERNION, SPIN, AngleUnit, Conventions, Header, is_number, read_header
 from .recordings import SI, Units, read_text, require_name, track_files, write_tracks
 
 Array = NDArray[np.float64]
 
-COLUMNS = ("time", "body", "px", "py", "pz", "qw", "qx", "qy", "qz", "wx", "wy", "wz", "fx", "fy", "fz")
-"""Quantities that a column may contain; `body`, the orientation (q, four), the spin (w, three) and the force that the
-body exerts (f, three) are optional."""
-_REQUIRED = ("time", "px", "py", "pz")
-_QUATERNION = ("qw", "qx", "qy", "qz")
-_SPIN = ("wx", "wy", "wz")
-_FORCE = ("fx", "fy", "fz")
-_NAMES = {
-    "time": ("time", "t", "timestamp", "timestamps", "stamp"),
-    "body": ("body", "object", "rigid_body"),
-    **{f"p{axis}": (f"p{axis}", axis, f"t{axis}", f"pos_{axis}", f"position_{axis}") for axis in "xyz"},
-    **{f"q{part}": (f"q{part}", f"q_{part}", f"quat_{part}", f"orientation_{part}") for part in "wxyz"},
-    **{
-        f"w{axis}": (f"w{axis}", f"w{axis}_rad", f"omega_{axis}", f"omega_{axis}_rad", f"angular_velocity_{axis}")
-        for axis in "xyz"
-    },
-    **{f"f{axis}": (f"f{axis}", f"f{axis}_n", f"force_{axis}", f"force_{axis}_n") for axis in "xyz"},
-}
-_UNIT = re.compile(r"^(.*?)[ _]*[(\[_ ](m|cm|mm|in|s|ms|us|ns)[)\]]?$")
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
-_LENGTHS, _TIMES = ("m", "cm", "mm", "in"), ("s", "ms", "us", "ns")
 
 
 @reads("source")
@@ -59,6 +40,9 @@ def import_csv(
     n_train: int | None = None,
     n_test: int | None = None,
     seed: int = 0,
+    frame_rate_hz: float | None = None,
+    euler: str | None = None,
+    angle_unit: AngleUnit | None = None,
     overwrite: bool = False,
 ) -> ImportResult:
     """Write CSV tracks as a capture; the user adds shape, mass and ground to its manifest.
@@ -66,7 +50,8 @@ def import_csv(
     The first line names the columns, separated by commas, semicolons or tabs. Several spellings are recognised
     (time, t, timestamp; px, x, tx, pos_x; qw, quat_w, ...), and names may end in their unit: `x_mm`, `Time (ms)`.
     Comments (#) may stand before it, and where no comma separates the columns, one may separate the decimals.
-    Lines without a position are gaps. Each file's times begin at zero.
+    Lines without a position are gaps. Each file's times begin at zero. Blanks in names of bodies
+    become '-', which is said.
 
     Args:
         source: A file, or a folder of .csv files, each an episode.
@@ -80,12 +65,19 @@ def import_csv(
         n_train: Number of episodes to fit on; None: 60 %.
         n_test: Number of episodes to test on; None: the others.
         seed: Seed of the permutation.
+        frame_rate_hz: The column of times, or one called frame, counts frames, at so many a second; without such a
+            column the lines of each body do.
+        euler: Order in which the angles of the columns roll, pitch, yaw (about x, y, z) turn, first to last: about
+            fixed axes in small letters, about those of the body in capitals. None: such columns are not read.
+        angle_unit: Unit of these angles, if the column names do not contain it.
         overwrite: Replace `out`.
 
     Raises:
         InputDataError: If a file is not such a track, or its numbers cannot be seconds and metres.
-        UsageError: If `out` exists, before anything is read.
+        UsageError: If `out` exists, before anything is read, or two options contradict each other.
     """
+    stated = Conventions(columns or {}, units, frame_rate_hz, euler, angle_unit)
+    stated.check()
     with new_directory(out, "capture", overwrite) as directory:
         for name in columns or {}:
             if name not in COLUMNS:
@@ -96,57 +88,54 @@ def import_csv(
                 )
         files = track_files(Path(source), (".csv",))
         left_out: Counter[str] = Counter()
-        tracks = (_tracks(path, columns or {}, units, body, left_out, spin_frame) for path in files)
+        renamed: dict[str, str] = {}
+        tracks = (_tracks(path, stated, body, left_out, renamed, spin_frame) for path in files)
         result = write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
-    return result.model_copy(update={"warnings": (*result.warnings, *_left_out_warnings(left_out, len(files)))})
+    said = (*_left_out_warnings(left_out, len(files), euler), *_renamed_warnings(renamed))
+    return result.model_copy(update={"warnings": (*result.warnings, *said)})
 
 
-@dataclass(frozen=True)
-class _Header:
-    """The header of a file."""
-
-    index: dict[str, int]
-    """Index of each column by the quantity in it."""
-    units: Units
-    """Units from the column names."""
-    decimal_comma: bool = False
-    """Whether a comma may separate the decimals, where it does not separate the columns."""
-
-
-def _left_out_warnings(left_out: Counter[str], files: int) -> tuple[str, ...]:
+def _left_out_warnings(left_out: Counter[str], files: int, euler: str | None) -> tuple[str, ...]:
     """Return one warning that names the columns that were not read, by how many of the files have them."""
     if not left_out:
         return ()
     places = {name: "" if count == files else f" (in {count} of {files} files)" for name, count in left_out.items()}
     named = ", ".join(f"{shown(name)}{place}" for name, place in places.items())
+    angles = "" if euler else "; or roll, pitch, yaw with the order of their turns, such as --euler xyz"
     return (
-        f"columns that were not read: {named}. Read are time, body, px, py, pz, qw, qx, qy, qz and "
+        f"columns that were not read: {named}. Read are time, body, px, py, pz, qw, qx, qy, qz{angles}; "
         "wx, wy, wz (rad/s; beside orientations with --spin-frame), fx, fy, fz (N).",
     )
 
 
+def _renamed_warnings(renamed: Mapping[str, str]) -> tuple[str, ...]:
+    """Return one warning that names the bodies that are called otherwise than in the files."""
+    named = ", ".join(f"{shown(name)} is '{legal}'" for name, legal in renamed.items() if legal != name)
+    return (f"blanks in names of bodies became '-': {named}.",) if named else ()
+
+
 def _tracks(
     path: Path,
-    columns: Mapping[str, str],
-    units: Units,
+    stated: Conventions,
     body: str,
     left_out: Counter[str],
+    renamed: dict[str, str],
     spin_frame: Literal["world", "body"] | None,
 ) -> dict[str, Track]:
-    """Return the tracks of a file, and count its columns that are not read in `left_out`."""
+    """Return the tracks of a file; count its columns that are not read, and note what its bodies are called."""
     text, separator = _without_comments(read_text(path))
     rows = csv_rows(path, text, separator)
     names = next((row for _, row in rows if any(cell.strip() for cell in row)), [])
-    header = replace(_header(path, names, columns, units), decimal_comma=separator != ",")
-    if spin_frame is None and _QUATERNION[0] in header.index:  # nothing says along which axes
-        header = replace(header, index={key: k for key, k in header.index.items() if key not in _SPIN})
+    header = replace(read_header(path, names, stated), decimal_comma=separator != ",")
+    if spin_frame is None and {QUATERNION[0], EULER[0]} & set(header.index):  # nothing says along which axes
+        header = replace(header, index={key: k for key, k in header.index.items() if key not in SPIN})
     left_out.update(name.strip() for k, name in enumerate(names) if k not in header.index.values())
-    by_body = _samples(path, header, len(names), rows, body)
+    by_body = _samples(path, header, len(names), rows, body, renamed)
     if not by_body:
         raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
     tracks = {}
     for name, values in by_body.items():
-        parts = _Parts.of(header, np.array(values))
+        parts = _Parts.of(header, np.array(values), stated)
         where = f"{path}: {name}"
         track = header.units.track(where, parts.time, parts.position, parts.quat, parts.omega, parts.force)
         tracks[name] = _with_body_spin(track) if spin_frame == "world" else track
@@ -164,7 +153,7 @@ def _without_comments(text: str) -> tuple[str, str]:
     if count:
         names = lines[count - 1].lstrip().lstrip("#").strip()
         cells = lines[count].split(separator)
-        numbers = all(_is_number(cell.strip()) or _DECIMAL_COMMA.match(cell.strip()) for cell in cells)
+        numbers = all(is_number(cell.strip()) or _DECIMAL_COMMA.match(cell.strip()) for cell in cells)
         named = numbers and len(names.split(separator)) == len(cells)
         lines[:count] = [""] * (count - 1) + [names if named else ""]
     return "\n".join(lines), separator
@@ -186,15 +175,34 @@ class _Parts:
     """Forces that the body exerts [N], shape (T, 3); NaN where they were not measured."""
 
     @staticmethod
-    def of(header: _Header, table: Array) -> _Parts:
-        """Divide a table whose columns are in the order of `COLUMNS`, without those that the file lacks."""
-        found: dict[str, Array | None] = {}
-        place = 4
-        for name, group in (("quat", _QUATERNION), ("omega", _SPIN), ("force", _FORCE)):
-            width = len(group) if group[0] in header.index else 0
-            found[name] = table[:, place : place + width] if width else None
-            place += width
-        return _Parts(table[:, 0], table[:, 1:4], **found)
+    def of(header: Header, table: Array, stated: Conventions) -> _Parts:
+        """Divide a table whose columns are those quantities of the header that are numbers, in their order."""
+        column = dict(zip(header.quantities, table.T, strict=True))
+
+        def columns(keys: tuple[str, ...]) -> Array | None:
+            return np.stack([column[key] for key in keys], 1) if keys[0] in column else None
+
+        time = column.get("time", np.arange(len(table), dtype=float))
+        quat, angles = columns(QUATERNION), columns(EULER)
+        if quat is None and angles is not None and stated.euler is not None:
+            quat = _quaternions(angles, stated.euler, header.angle_unit == "deg")
+        position = np.stack([column[key] for key in ("px", "py", "pz")], 1)
+        return _Parts(time / (stated.frame_rate_hz or 1.0), position, quat, columns(SPIN), columns(FORCE))
+
+
+def _quaternions(angles: Array, order: str, degrees: bool) -> Array:
+    """Return orientations (T, 4), w first, of angles (T, 3) about x, y and z; NaN where one of them is.
+
+    Args:
+        angles: Angles of `EULER`.
+        order: Axes of the turns, first to last: fixed ones in small letters, those of the body in capitals.
+        degrees: Whether they are in degrees, else in radians.
+    """
+    known = np.isfinite(angles).all(1)
+    turns = angles[known][:, ["xyz".index(axis) for axis in order.lower()]]
+    quat = np.full((len(angles), 4), np.nan)
+    quat[known] = Rotation.from_euler(order, turns, degrees=degrees).as_quat(scalar_first=True)
+    return quat
 
 
 def _with_body_spin(track: Track) -> Track:
@@ -209,10 +217,15 @@ def _with_body_spin(track: Track) -> Track:
 
 
 def _samples(
-    path: Path, header: _Header, width: int, rows: Iterable[tuple[int, list[str]]], body: str
+    path: Path,
+    header: Header,
+    width: int,
+    rows: Iterable[tuple[int, list[str]]],
+    body: str,
+    renamed: dict[str, str],
 ) -> dict[str, list[list[float]]]:
-    """Return the numbers of the lines by body, in the order of `COLUMNS`; every line has `width` cells."""
-    wanted = [name for name in COLUMNS if name in header.index and name != "body"]
+    """Return the numbers of the lines by body, as the header orders them; every line has `width` cells."""
+    wanted = header.quantities
     by_body: dict[str, list[list[float]]] = {}
     for line, row in rows:
         if not any(cell.strip() for cell in row):
@@ -221,106 +234,30 @@ def _samples(
             raise InputDataError(
                 f"{path}, line {line}: {len(row)} values under {width} columns.", todo="correct the line."
             )
-        name = row[header.index["body"]].strip() if "body" in header.index else body
-        if name not in by_body:
-            require_name(name, f"{path}, line {line}" if "body" in header.index else "--body")
+        if "body" in header.index:
+            name = _body_name(row[header.index["body"]].strip(), renamed, f"{path}, line {line}")
+        else:
+            name = body if body in by_body else require_name(body, "--body")
         by_body.setdefault(name, []).append([_number(path, line, row, header, key) for key in wanted])
     return by_body
 
 
-def _header(path: Path, found: list[str], columns: Mapping[str, str], units: Units) -> _Header:
-    names = [name.strip() for name in found]
-    if not any(names):
-        raise InputDataError(
-            f"{path}: empty, without a first line that names the columns.",
-            f"a header line with {', '.join(_REQUIRED)}, and a line for each sample.",
-            "export the recording again, or remove the file.",
-        )
-    if all(map(_is_number, names)):
-        raise InputDataError(
-            f"{path}: the first line holds numbers, so that nothing says what the {len(names)} columns are.",
-            "a first line with the names of the columns, such as time,px,py,pz,qw,qx,qy,qz.",
-            f"put such a line first, for example: sed -i '1i time,px,py,pz' '{path}'",
-        )
-    index = {key: k for key in COLUMNS if (k := _place(path, names, key, columns)) is not None}
-    _require_columns(path, names, index)
-    return _Header(index, _units(path, names, index, units))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        number_of(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _require_columns(path: Path, names: list[str], index: Mapping[str, int]) -> None:
-    """Check that time and position have columns, and either all or none of the orientation and of the spin."""
-    lacking = [key for key in _REQUIRED if key not in index]
-    group = _QUATERNION
-    for some in (_QUATERNION, _SPIN, _FORCE):
-        if not lacking and any(key in index for key in some):
-            group, lacking = some, [key for key in some if key not in index]
-    if lacking:
-        raise InputDataError(
-            f"{path}: no column for '{lacking[0]}' among {', '.join(names) or 'none'}.",
-            f"a header line with {', '.join(_REQUIRED)}, and all of {', '.join(group)} or none.",
-            f"name it: --columns {lacking[0]}=NAME.",
-        )
-
-
-def _units(path: Path, names: list[str], index: Mapping[str, int], units: Units) -> Units:
-    """Return the units of the options and of the column names, which must not contradict each other."""
-    for kind, legal, keys in (("length", _LENGTHS, _REQUIRED[1:]), ("time", _TIMES, _REQUIRED[:1])):
-        by_name = {names[index[key]]: unit for key in keys if (unit := _plain(names[index[key]])[1]) in legal}
-        silent = [names[index[key]] for key in keys if names[index[key]] not in by_name]
-        if by_name and silent and getattr(units, kind) is None:
+def _body_name(name: str, renamed: dict[str, str], where: str) -> str:
+    """Return what a body of a file is called in the capture, blanks replaced, and note it by its name there."""
+    if name not in renamed:
+        legal = require_name("-".join(name.split(" ")), where)
+        twin = next((other for other, given in renamed.items() if given == legal), None)
+        if twin is not None:
             raise InputDataError(
-                f"{path}: '{next(iter(by_name))}' names its unit, and {' and '.join(map(shown, silent))} none.",
-                f"a unit in all of {', '.join(names[index[key]] for key in keys)}, or in none.",
-                f"rename the columns, or state it for all: --{kind}-unit {next(iter(by_name.values()))}.",
+                f"{where}: {shown(name)} and {shown(twin)} would both be called '{legal}'.",
+                "names that differ by more than blanks.",
+                "change one of them there.",
             )
-        named = set(by_name.values())
-        named |= {getattr(units, kind)} - {None}
-        if len(named) > 1:
-            raise InputDataError(
-                f"{path}: units of {kind} that differ: {', '.join(sorted(named))}.",
-                "one unit for all columns.",
-                "convert the columns to one unit, and name it in the first line.",
-            )
-        units = replace(units, **{kind: next(iter(named), None)})
-    return units
+        renamed[name] = legal
+    return renamed[name]
 
 
-def _place(path: Path, names: list[str], key: str, columns: Mapping[str, str]) -> int | None:
-    """Return the index of the column with the quantity `key`, or None."""
-    if key in columns:
-        if columns[key] not in names:
-            raise InputDataError(
-                f"{path}: no column '{columns[key]}' (--columns {key}={columns[key]}).",
-                f"{', '.join(names)}.",
-                f"choose one of these: --columns {key}=NAME.",
-            )
-        return names.index(columns[key])
-    hits = [k for k, name in enumerate(names) if _plain(name)[0] in _NAMES[key]]
-    if len(hits) > 1:
-        raise InputDataError(
-            f"{path}: '{names[hits[0]]}' and '{names[hits[1]]}' may both be '{key}'.",
-            "one.",
-            f"choose: --columns {key}=NAME.",
-        )
-    return hits[0] if hits else None
-
-
-def _plain(name: str) -> tuple[str, str]:
-    """Return a column's name in lower case without its unit, and the unit or an empty string."""
-    name = name.strip().lower()
-    found = _UNIT.match(name)
-    return (found[1].strip(" _").replace(" ", "_"), found[2]) if found else (name.replace(" ", "_"), "")
-
-
-def _number(path: Path, line: int, row: list[str], header: _Header, key: str) -> float:
+def _number(path: Path, line: int, row: list[str], header: Header, key: str) -> float:
     cell = row[header.index[key]].strip()
     try:
         plain = cell.replace(",", ".") if header.decimal_comma and _DECIMAL_COMMA.match(cell) else cell

@@ -29,7 +29,7 @@ LengthUnit = Literal["m", "cm", "mm", "in"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
 LENGTHS_M: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-_TIMES_S: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TIMES_S: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOWEST_STEP_S, _LONGEST_PATH_M = 1.0, 100.0
 """Largest time step and largest extent of a path for which numbers without a unit count as seconds and metres."""
 FASTEST_RAD_S = 5000.0
@@ -126,7 +126,7 @@ class Units:
         omega = None if omega_rad_s is None else _spin(where, omega_rad_s[seen])
         quat = None if quat_wxyz is None else _unit(where, quat_wxyz[seen])
         track = Track(
-            time * _TIMES_S[self.time or "s"],
+            time * TIMES_S[self.time or "s"],
             position * LENGTHS_M[self.length or "m"],
             quat,
             omega_body_rad_s=omega,
@@ -164,7 +164,8 @@ class Units:
                 "seconds, or another unit that is named.",
                 f"add --time-unit {unit} (or, if these are seconds: --time-unit s)."
                 if step != 1
-                else "divide numbers of frames by the frame rate, or add --time-unit ms (if these are seconds: s).",
+                else "numbers of frames: divide them by the frame rate (csv: --frame-rate HZ). Or add --time-unit ms "
+                "(if these are seconds: s).",
             )
         if self.length is None and spread > _LONGEST_PATH_M:
             raise InputDataError(

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from ...schemas import PhysConfig, SplatConfig
+from ...schemas import PhysConfig, Provenance, SplatConfig
 from ..capture.capture import Capture
 from ..capture.colmap_model import find_colmap_model
 from ..capture.geometry_maps import KINDS
@@ -80,3 +80,25 @@ def _shapes(capture: Capture) -> dict[str, str]:
     files = [file for body in capture.manifest.bodies if (file := capture.shape_file(body)) is not None]
     files += [capture.root / entry.path for entry in capture.manifest.articulations]
     return {file.relative_to(capture.root).as_posix(): sha256(file) for file in files if file.is_file()}
+
+
+def changed_since_fit(provenance: Provenance, capture: Capture) -> list[str]:
+    """Return a warning if a capture's manifest is no longer the one that a model was fitted with, else nothing.
+
+    The same capture is recognised by a track or the cameras that the fit has read, as its directory may have moved.
+
+    Args:
+        provenance: Of the model.
+        capture: Where the model is applied.
+    """
+    read = provenance.input_sha256
+    shared = [name for name in read if name.startswith("tracks/") or name == "cameras.json"]
+    there = [name for name in shared if (capture.root / name).is_file()]
+    same = any(read[name] == sha256(capture.root / name) for name in there[:1])
+    manifest = capture.root / "capture.toml"
+    if not same or "capture.toml" not in read or read["capture.toml"] == sha256(manifest):
+        return []
+    return [
+        f"{manifest} has changed since the model was fitted: what it says of world and bodies is in the model "
+        "as it was then. Fit again if one of these has changed."
+    ]

@@ -12,6 +12,7 @@ from ...datasets.capture.tracks import Episode
 from ...datasets.io.atomic import new_file, sha256
 from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note, progress
+from ...datasets.models.fit_inputs import changed_since_fit
 from ...datasets.models.model import Model, read_model
 from ...schemas import CompareResult, InputDataError, PairedDifference, UsageError
 from ...schemas.regular_files import real_path
@@ -143,6 +144,7 @@ def compare_models(
         warnings=(
             *_fitted_to_them(compared, capture, shared),
             *_left_out(names, shared),
+            *dict.fromkeys(text for _, model in models for text in changed_since_fit(model.file.provenance, capture)),
             *clocked,
             *prepared.warnings,
         ),

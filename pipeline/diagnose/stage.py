@@ -15,6 +15,7 @@ from ...datasets.capture.capture import Capture
 from ...datasets.io.atomic import new_file
 from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note
+from ...datasets.models.fit_inputs import changed_since_fit
 from ...datasets.models.laws import refuse_paper_law
 from ...datasets.models.model import Model, read_model
 from ...schemas import (
@@ -179,7 +180,8 @@ def prepared_world(
         if unlike:
             kept = [episode for episode in found.episodes if episode[0] not in unlike]
             prepared = prepare(world, kept, found.noise, _groups(capture, [name for name, _ in kept]))
-    prepared = replace(prepared, warnings=(*found.warnings, *unlike_warnings(unlike), *prepared.warnings))
+    changed = changed_since_fit(model.file.provenance, capture)
+    prepared = replace(prepared, warnings=(*changed, *found.warnings, *unlike_warnings(unlike), *prepared.warnings))
     check_observability(world, prepared, str(capture.root))
     return world, prepared
 

@@ -24,6 +24,7 @@ from ...datasets.io.atomic import new_file
 from ...datasets.io.kinds import kind_of
 from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import progress
+from ...datasets.models.fit_inputs import changed_since_fit
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.loader import RolloutReader
 from ...schemas import ErrorSummary, EvalResult, InputDataError, Reference, UsageError
@@ -156,7 +157,7 @@ def evaluate_model(
         episodes, warnings = _tracked(model, capture, split)
         noise = _noise(model, capture, episodes)
     episodes, held = _released(world, episodes, noise)
-    warnings += held
+    warnings += [*held, *changed_since_fit(model.file.provenance, capture)]
     cameras = {} if brief else _cameras(model, capture, [name for name, _ in episodes], warnings)
     videos = (
         VideoErrors(model=model, capture=capture, device=str(resolve_device(device)), keep_frames=keep_frames)

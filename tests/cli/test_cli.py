@@ -101,6 +101,13 @@ def test_help_imports_nothing_heavy() -> None:
     assert set(modules.split()) & set(heavy) == set()
 
 
+def test_a_module_that_was_not_linked_is_said_with_what_to_do(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cgwm.pipeline.validate", None)
+    code, out, err = run("validate", "nowhere")
+    assert (code, out) == (1, "")
+    assert "lacks 'cgwm.pipeline.validate'" in err and "'make install'" in err
+
+
 def test_help_names_every_verb_and_the_exit_codes(run: Run) -> None:
     code, out, err = run("--help")
     assert (code, err) == (0, "")

@@ -26,6 +26,7 @@ from cgwm.datasets import (
 )
 from cgwm.datasets.importers.jugglebot import flight
 from cgwm.schemas import InputDataError, UsageError
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 SHARED = Path(os.environ.get("CGWM_SHARED_DATA", Path(__file__).parents[4] / "shared" / "data"))
@@ -185,7 +186,83 @@ def test_what_is_no_plain_number_is_refused_with_its_line(number: str, tmp_path:
     assert fault(tmp_path, import_tum, tmp_path / "a.txt").startswith("T/a.txt, line 2: '")
 
 
-@pytest.mark.parametrize("name", ["a b", "../a", "a\x1b[31m", "", "x" * 10 + "/"])
+def test_blanks_in_names_of_bodies_are_replaced_and_said(tmp_path: Path) -> None:
+    rows = [f"{t},{name},{t},2,3" for t in (0.0, 0.1) for name in ("Rigid Body 1", "Rigid Body 2", "floor")]
+    (tmp_path / "a.csv").write_text("\n".join(["t,body,x,y,z", *rows]))
+    result = import_csv(tmp_path / "a.csv", tmp_path / "out")
+    assert set(Capture.open(tmp_path / "out").tracks("a")) == {"Rigid-Body-1", "Rigid-Body-2", "floor"}
+    assert "'Rigid Body 1' is 'Rigid-Body-1', 'Rigid Body 2' is 'Rigid-Body-2'." in result.warnings[-1]
+    (tmp_path / "a.csv").write_text("\n".join(["t,body,x,y,z", *rows, "0,Rigid Body-1,0,2,3"]))
+    text = fault(tmp_path, import_csv, tmp_path / "a.csv")
+    assert "line 8: 'Rigid Body-1' and 'Rigid Body 1' would both be called 'Rigid-Body-1'" in text
+
+
+@pytest.mark.parametrize("header", ["frame,x,y,z", "time,x,y,z", "x,y,z", "Frame,Time (s),x,y,z"])
+def test_frames_are_counted_at_a_rate(tmp_path: Path, header: str) -> None:
+    columns = [np.arange(5.0)[:, None], POSITIONS]
+    if "Time (s)" in header:
+        columns.insert(1, np.full((5, 1), 7.0))
+    table = np.hstack(columns if header != "x,y,z" else columns[1:])
+    (tmp_path / "a.csv").write_text("\n".join([header, *(",".join(map(str, row)) for row in table.tolist())]))
+    result = import_csv(tmp_path / "a.csv", tmp_path / "out", frame_rate_hz=250.0)
+    np.testing.assert_allclose(track_of(tmp_path / "out", "a").time_s, np.arange(5) / 250, atol=1e-12)
+    assert ("'Time (s)'" in "".join(result.warnings)) == ("Time (s)" in header)
+
+
+def test_a_frame_rate_beside_a_unit_of_time_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("Time (ms),x,y,z\n0,1,2,3\n1,1,2,3\n")
+    assert "'Time (ms)' names a unit of time" in fault(tmp_path, import_csv, tmp_path / "a.csv", frame_rate_hz=100.0)
+    for rate, units, part in (
+        (100.0, Units(time="ms"), "--time-unit"),
+        (0.0, Units(), "--frame-rate 0"),
+        (np.nan, Units(), "nan"),
+    ):
+        with pytest.raises(UsageError, match=part):
+            import_csv(tmp_path / "a.csv", tmp_path / "out", units=units, frame_rate_hz=rate)
+    assert not (tmp_path / "out").exists()
+
+
+def test_angles_are_read_in_their_order(tmp_path: Path) -> None:
+    roll, pitch, yaw = 0.3, -0.4, 1.1
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a), np.sin(a)) for a in (roll, pitch, yaw))
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    (tmp_path / "a.csv").write_text(
+        f"t,x,y,z,roll,pitch,yaw\n0,1,2,3,{roll},{pitch},{yaw}\n0.1,1,2,3,{roll},{pitch},{yaw}\n"
+    )
+    degrees = [np.rad2deg(a) for a in (roll, pitch, yaw)]
+    row = ",".join(map(str, degrees))
+    (tmp_path / "b.csv").write_text(
+        f"t,x,y,z,Roll (deg),Pitch (deg),Yaw (deg)\n0,1,2,3,{row}\n0.1,1,2,3,{row}\n0.2,1,2,3,,,\n"
+    )
+    for order, expected in (("xyz", about_z @ about_y @ about_x), ("XYZ", about_x @ about_y @ about_z)):
+        import_csv(tmp_path / "a.csv", tmp_path / f"a-{order}", euler=order, angle_unit="rad")
+        import_csv(tmp_path / "b.csv", tmp_path / f"b-{order}", euler=order)
+        for name in "ab":
+            quat = track_of(tmp_path / f"{name}-{order}", name).quat_wxyz
+            found = Rotation.from_quat(quat, scalar_first=True).as_matrix()
+            np.testing.assert_allclose(found, np.stack([expected] * 2), atol=1e-6)
+    unread = import_csv(tmp_path / "a.csv", tmp_path / "unread")
+    assert "--euler xyz" in unread.warnings[0] and track_of(tmp_path / "unread", "a").quat_wxyz is None
+
+
+def test_angles_without_order_unit_or_columns_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,x,y,z,roll,pitch,yaw_deg\n0,1,2,3,0,0,0\n0.1,1,2,3,0,0,0\n")
+    text = fault(tmp_path, import_csv, tmp_path / "a.csv", euler="xyz", angle_unit="rad")
+    assert "units of angles that differ: deg, rad" in text
+    (tmp_path / "b.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,1,2,3,0,0,0\n0.1,1,2,3,0,0,0\n")
+    assert "nothing says in which unit 'roll', 'pitch', 'yaw' are" in fault(
+        tmp_path, import_csv, tmp_path / "b.csv", euler="xyz"
+    )
+    (tmp_path / "c.csv").write_text("t,x,y,z\n0,1,2,3\n0.1,1,2,3\n")
+    assert "no column for 'roll'" in fault(tmp_path, import_csv, tmp_path / "c.csv", euler="zyx", angle_unit="deg")
+    for words, part in (({"euler": "xyx"}, "--euler 'xyx'"), ({"angle_unit": "deg"}, "without --euler")):
+        with pytest.raises(UsageError, match=part):
+            import_csv(tmp_path / "b.csv", tmp_path / "out", **words)
+
+
+@pytest.mark.parametrize("name", ["a\tb", "../a", "a\x1b[31m", "", "x" * 10 + "/"])
 def test_names_that_no_manifest_takes_are_refused(name: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(f"t,body,x,y,z\n0,cube,1,2,3\n0.1,{name},1,2,3\n", encoding="utf-8")
     assert "T/a.csv, line 3: '" in fault(tmp_path, import_csv, tmp_path / "a.csv")
@@ -244,7 +321,7 @@ def test_csv_faults(tmp_path: Path) -> None:
     assert "'p' is nothing that a column can be" in said("t,x,y,z\n", columns={"p": "x"})
     assert "time 0 comes after 0.1" in said("t,x,y,z\n0.1,1,2,3\n0,1,2,3\n")
     assert "remove the samples that are there twice" in said("t,x,y,z\n0,1,2,3\n0,1,2,3\n0.1,1,2,3\n")
-    assert "divide numbers of frames by the frame rate" in said("t,x,y,z\n0,1,2,3\n1,1,2,3\n2,1,2,3\n")
+    assert "numbers of frames: divide them by the frame rate" in said("t,x,y,z\n0,1,2,3\n1,1,2,3\n2,1,2,3\n")
     assert "'1,000,000' is no number" in said("t;x;y;z\n0;1,000,000;2;3\n")
     assert "another norm than 1, the first 2.0000" in said("t,x,y,z,qw,qx,qy,qz\n0,1,2,3,2,0,0,0\n0.1,1,2,3,1,0,0,0\n")
     assert "2 training and 0 test episodes of 1 recordings" in said("t,x,y,z\n0,1,2,3\n0.1,1,2,3\n", n_train=2)
