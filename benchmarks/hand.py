@@ -12,12 +12,14 @@ Clocks: real charges each plan its wall time, cpu the time of all processors (wh
 nothing. Contenders: mppi, both, gauss-newton; `hold` never moves: what the goals give by chance; `cem`: see
 `hand_cem.py`, with compute for free (`--clock ideal --hz 20`); `compared`: as mppi, and what the other solvers make of
 some of its plans, a row for each. A run that reaches the limit of wall time is "cut". For
-a real clock on some cores of a machine: `taskset -c`, one process each.
+a real clock on some cores of a machine: `taskset -c`, one process each. Several runs on one GPU: `--turns FILE`, the
+same file for each, lets them plan one after the other, while the others' plants, which no clock charges, go on.
 """
 
 from __future__ import annotations
 
 import argparse
+import fcntl
 import math
 import os
 import shutil
@@ -25,6 +27,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from itertools import combinations, product
 from pathlib import Path
@@ -36,7 +39,8 @@ from cgwm.datasets.models.model import Model, read_model
 from cgwm.pipeline.control.hand_controller import HandController
 from cgwm.pipeline.control.hand_loop import run_hand
 from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
-from cgwm.pipeline.control.horizon import Array
+from cgwm.pipeline.control.horizon import Array, Forecast
+from cgwm.pipeline.control.planning import ControlPlan, ControlState, PlanningController
 from cgwm.pipeline.control.solvers import Solution
 from cgwm.pipeline.runtime.resources import no_garbage_search
 from cgwm.schemas import ContactParameters, HandTask, NotConvergedError
@@ -169,6 +173,29 @@ class Limited:
         self._note({"ended": UNFINISHED, "time_s": round(self._time_s, 2), "goals": self._goals})
 
 
+@contextmanager
+def turn(path: Path | None) -> Iterator[None]:
+    """Wait until no other process has its turn by a file, and have it; no file, no waiting."""
+    if path is None:
+        yield
+        return
+    with path.open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def plan_in_turn(controller: PlanningController, path: Path | None) -> None:
+    """Let a controller wait for its turn before its plans, whose time begins after it, and make no forecasts."""
+    made = type(controller).plan
+
+    def plan(state: ControlState | None, acts_s: float | None = None) -> ControlPlan | None:
+        with turn(path):
+            return made(controller, state, acts_s)
+
+    nowhere = Forecast(times_s=np.zeros(1), position_m=np.full((1, 3), np.nan), quat_wxyz=np.full((1, 4), np.nan))
+    controller.plan, controller.forecast = plan, lambda: nowhere
+
+
 def measure(
     name: str, task: HandTask, seed: int, given: argparse.Namespace, end_s: float, note: Note
 ) -> dict[str, Any]:
@@ -189,6 +216,8 @@ def measure(
         )
     if clock == "cpu":
         charge_processors(controller)
+    elif name != "cem":
+        plan_in_turn(controller, given.turns)
     before = os.getloadavg()[0]
     plant = Limited(HandScenePlant(controller.hand), controller, end_s, note)
     with no_garbage_search():
@@ -254,6 +283,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path, default=None, help="a fitted model of the cube in place of the true one")
     parser.add_argument("--plant", default="", help="errors of the plant, as friction_factor=0.5,delay_s=0.03")
     parser.add_argument("--draws", type=int, default=0, help="of friction, whose standard error is 70 %% then")
+    parser.add_argument("--turns", type=Path, default=None, help="a file: runs with the same one plan in turn")
     parser.add_argument("--limit", type=float, default=math.inf, help="wall time after which runs are cut [s]")
     given = parser.parse_args()
     end_s = time.monotonic() + given.limit

@@ -270,6 +270,7 @@ class PlanningController(ABC):
         return self._plan
 
     @torch.no_grad()
+    @one_torch_thread()
     def forecast(self) -> Forecast:
         """Return what the model predicts of the last plan.
 
