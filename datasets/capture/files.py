@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import unicodedata
-from collections.abc import Collection
+from collections import defaultdict
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from ...schemas import InputDataError
 from ...schemas.regular_files import require_regular_file
+from ..io.atomic import sha256
 
 MOST_FILES = 1_000_000
 """Maximum number of files under a directory: links to directories multiply, and may do so without end."""
@@ -88,6 +90,25 @@ def files_under(folder: Path, suffixes: Collection[str] = ()) -> list[str]:
         if len(names) > MOST_FILES or len(places) > MOST_FILES:
             raise InputDataError(f"{folder}: more than {MOST_FILES} files.", f"{MOST_FILES}.", "remove some.")
     return sorted(names)
+
+
+def repeated(paths: Iterable[Path]) -> dict[Path, Path]:
+    """Return the files whose bytes are those of another one, each with that one, the shortest name first.
+
+    Raises:
+        InputDataError: If one is no regular file that can be read.
+    """
+    sized: dict[int, list[Path]] = defaultdict(list)
+    for path in sorted(paths, key=lambda one: (len(one.name), one)):
+        sized[require_regular_file(path).stat().st_size].append(path)
+    found: dict[Path, Path] = {}
+    for alike in sized.values():
+        first: dict[str, Path] = {}
+        for path in alike if len(alike) > 1 else ():
+            earlier = first.setdefault(sha256(path), path)
+            if earlier is not path:
+                found[path] = earlier
+    return found
 
 
 def require_printable(name: str, where: str) -> None:

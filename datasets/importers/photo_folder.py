@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...schemas.imports import ImportResult
+from ..capture.files import repeated
 from ..io.atomic import new_directory
 from ..io.outputs import reads
 from .photo_captures import copy_photos, photos_in, write_photo_capture
@@ -15,7 +16,7 @@ def import_photos(source: Path | str, out: Path | str, overwrite: bool = False) 
     """Write the photos of a folder as a capture, whose cameras `cgwm calibrate` estimates.
 
     JPEG and PNG files are copied as they are; HEIC is converted to JPEG, turned upright, with its EXIF data. The
-    colours of a wide-gamut photo are kept as numbers, not converted.
+    colours of a wide-gamut photo are kept as numbers, not converted. A file that is there twice is taken once.
 
     Args:
         source: The folder.
@@ -28,5 +29,8 @@ def import_photos(source: Path | str, out: Path | str, overwrite: bool = False) 
     """
     with new_directory(out, "capture", overwrite) as directory:
         photos = photos_in(Path(source))
+        again = repeated([photo.source for photo in photos])
+        photos = [photo for photo in photos if photo.source not in again]
         copy_photos(directory, photos)
-        return write_photo_capture(directory, out, len(photos))
+        notes = [f"{copy.name} is the same file as {first.name} and was left out" for copy, first in again.items()]
+        return write_photo_capture(directory, out, len(photos), warnings=notes)

@@ -306,7 +306,10 @@ def _drop_outliers(reconstruction: Any, limit: float) -> None:
 
 
 def _residuals(reconstruction: Any) -> list[tuple[Any, Any, Array]]:
-    """Return each registered image with the indices of its observations and their reprojection errors [px]."""
+    """Return each registered image with the indices of its observations and their reprojection errors [px].
+
+    The error of a point behind the camera, as two photos from one place may triangulate it, is infinite.
+    """
     found = []
     for image in sorted(reconstruction.images.values(), key=lambda one: one.image_id):
         observed = [k for k, point in enumerate(image.points2D) if point.has_point3D()] if image.has_pose else []
@@ -316,7 +319,8 @@ def _residuals(reconstruction: Any) -> list[tuple[Any, Any, Array]]:
         world = np.array([reconstruction.points3D[image.points2D[k].point3D_id].xyz for k in observed])
         pose = image.cam_from_world().matrix()
         drawn = reconstruction.cameras[image.camera_id].img_from_cam(world @ pose[:, :3].T + pose[:, 3])
-        found.append((image, np.array(observed), np.linalg.norm(drawn - seen, axis=1)))
+        lengths = np.linalg.norm(drawn - seen, axis=1)  # COLMAP draws no point behind the camera: NaN
+        found.append((image, np.array(observed), np.where(np.isnan(lengths), np.inf, lengths)))
     return found
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.exif import photo_lens
+from ...datasets.capture.files import repeated
 from ...datasets.capture.images import image_size, write_image
 from ...datasets.io.progress import progress
 from ...schemas import CameraIntrinsics, InputDataError
@@ -159,7 +160,8 @@ def _photos(capture: Capture, root: Path) -> tuple[list[Source], list[str], dict
         alike = sum(_alike(one, name, sizes, lenses) for one in names) if same else 1
         richest[camera] = "OPENCV" if alike >= _FEW_PHOTOS else "SIMPLE_RADIAL"
         sources.append(Source(name, SfmImage(inside, camera)))
-    notes = []
+    again = repeated([capture.root / "images" / name for name in names])
+    notes = [f"{copy.name} is the same photo as {first.name}: remove one" for copy, first in again.items()]
     if same and len(distinct) > 1:
         listed = ", ".join(f"{width}x{height}" for width, height in distinct)
         notes.append(f"photos of {len(distinct)} sizes ({listed}): each size has separate intrinsics")

@@ -163,6 +163,14 @@ def test_photos_are_copied_and_heic_is_converted_upright_with_its_focal_length(t
     assert kept.get_ifd(0x8769)[0xA405] == 26 and 0x0112 not in kept
 
 
+def test_a_photo_that_is_there_twice_is_taken_once(tmp_path: Path) -> None:
+    _photos(tmp_path / "in", ["IMG 1.jpg", "IMG 2.jpg"])
+    (tmp_path / "in" / "IMG 1 (1).jpg").write_bytes((tmp_path / "in" / "IMG 1.jpg").read_bytes())
+    result = import_photos(tmp_path / "in", tmp_path / "out")
+    assert result.warnings == ("IMG 1 (1).jpg is the same file as IMG 1.jpg and was left out",)
+    assert Capture.open(tmp_path / "out").photos() == ["IMG 1.jpg", "IMG 2.jpg"]
+
+
 def test_a_walk_gives_sharp_frames_at_equal_distances(tmp_path: Path) -> None:
     write_walk(tmp_path / "walk.mp4")
     result = import_video(tmp_path / "walk.mp4", tmp_path / "out", photos=6)

@@ -71,3 +71,4 @@ def test_photos_of_two_lenses_have_intrinsics_of_their_own(tmp_path: Path) -> No
     cameras = [source.image.camera for source in inputs.sources]
     assert cameras == ["photos-lens1", "photos-lens1", "photos-lens2", "photos-lens1"]
     assert any("EXIF data name 2 lenses" in note for note in inputs.notes)
+    assert "1.jpg is the same photo as 0.jpg: remove one" in inputs.notes

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from cgwm.datasets.synthetic.rig import look_at
 from cgwm.pipeline.calibrate import attempts
-from cgwm.pipeline.calibrate.mapping import Mapped
+from cgwm.pipeline.calibrate.mapping import Mapped, without_outliers
 from cgwm.pipeline.calibrate.reconstruction import SfmCamera, SfmModel
 from cgwm.pipeline.calibrate.track_alignment import aligned
 from numpy.typing import NDArray
@@ -102,6 +102,19 @@ def test_other_observations_make_the_same_model_of_colmap() -> None:
         assert np.allclose(again.T_cam_world[name], pose)
         assert np.allclose(again.observations[name][0], moved[name][0])
     assert np.allclose(again.points, model.points) and again.cameras == model.cameras
+
+
+def test_a_point_behind_a_camera_is_taken_for_a_wrong_match() -> None:
+    """Two photos from one place may triangulate one there; its error was NaN, on which COLMAP's adjustment failed."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 4, 60
+    found = Mapped(reconstruction=pycolmap.synthesize_dataset(options), names={1: "photos"})
+    point = next(iter(found.reconstruction.points3D.values()))
+    image = found.reconstruction.images[point.track.elements[0].image_id]
+    point.xyz = 2 * image.projection_center() - point.xyz
+    assert np.isinf(found.residuals_px().max()) and not np.isnan(found.residuals_px()).any()
+    after = without_outliers(found, {}, 0)
+    assert after.image_count == 4 and after.residuals_px().max() < 1e-6
 
 
 def test_a_model_whose_photo_sees_no_point_is_known_for_it() -> None:
