@@ -39,8 +39,10 @@ class Fingertips:
 
     def places(self, motion: Rollout) -> Tensor:
         """Return the places (b, frames, tips, 3) of the tips in a motion [m]."""
-        links = list(self.links)
-        return motion.position_m[:, :, links] + quat_rotate(motion.quat_wxyz[:, :, links], self.points)
+        # indexing by a list takes twice as long
+        links = torch.tensor(self.links, dtype=torch.long)
+        places, turns = (part.index_select(2, links) for part in (motion.position_m, motion.quat_wxyz))
+        return places + quat_rotate(turns, self.points)
 
 
 def _points(world: World, chain: Chain, link: str) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -21,6 +21,8 @@ from .objective import Draw, Worlds, costs_of
 
 FRAMES = 5
 """Largest number of frames of a piece whose errors count."""
+SAME_DIGITS = 12
+"""Decimal digits of a piece's length [s] by which it is told from others: less than what clocks tell apart."""
 SINGLE = (0.1, 0.8)
 """Smallest and largest standard deviation of changes of a few joints, in units of the bound."""
 CHANGED_SHARE = 0.25
@@ -137,12 +139,19 @@ class HandObjective:
         command = JointCommand.targets(times[None], targets)
         return rollout(world, self.state, self._frames, {self.hand.chain.name: command}), targets
 
-    @cached_property
+    @property
     def _frames(self) -> Tensor:
         """Times of the predicted frames, from the state on [s]: up to `FRAMES` in a piece, at whole steps."""
-        step_s, found = self.hand.task.planner.step_s, [0.0]
-        for length in np.diff(self.times_s):
-            steps = max(1, math.ceil(length / step_s - 1e-6))
-            frames = min(FRAMES, steps)
-            found += (found[-1] + length * np.round(np.arange(1, frames + 1) * steps / frames) / steps).tolist()
-        return torch.tensor(found, dtype=torch.float64)
+        lengths = np.diff(self.times_s).round(SAME_DIGITS)  # plans at other times share what follows from them
+        return _frames_of(tuple(lengths.tolist()), self.hand.task.planner.step_s)
+
+
+@lru_cache(maxsize=64)
+def _frames_of(lengths_s: tuple[float, ...], step_s: float) -> Tensor:
+    """Return the times of frames [s] in pieces of some lengths [s]: up to `FRAMES` in each, at whole steps."""
+    found = [0.0]
+    for length in lengths_s:
+        steps = max(1, math.ceil(length / step_s - 1e-6))
+        frames = min(FRAMES, steps)
+        found += (found[-1] + length * np.round(np.arange(1, frames + 1) * steps / frames) / steps).tolist()
+    return torch.tensor(found, dtype=torch.float64)

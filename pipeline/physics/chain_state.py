@@ -258,8 +258,6 @@ def _posed(
     speeds: Mapping[str, float | Tensor],
     placed: bool = True,
 ) -> State:
-    names = world.body_names
-    rows = [names.index(name) for name in chain.links]
     like = state.position_m
     columns = []
     for given in (values, speeds):
@@ -275,6 +273,8 @@ def _posed(
     if known and not placed:
         _MADE[found.position_m] = _Made(chain.identity, _versions(found), value, speed)
         return found
+    names = world.body_names
+    rows = [names.index(name) for name in chain.links]
     root = rows[0]
     position, quat = chain.poses(state.position_m[:, root], state.quat_wxyz[:, root], value)
     first = (state.velocity_m_s[:, root], quat_rotate(state.quat_wxyz[:, root], state.omega_body_rad_s[:, root]))

@@ -292,9 +292,9 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
         columns.append(turn[None])
     columns += [in_frame(turn, effect) if effect.shape[-1] == 3 else effect for effect in effects]
     columns += tree.columns(world, state)
-    others = None if all(body.free for body in world.bodies) else _other_columns(world, state, turn)
-    for free, group in groupby(range(len(world.bodies)), lambda index: world.bodies[index].free):
-        rows = [*group]
+    groups = world.once(_groups)
+    others = None if all(free for free, _ in groups) else _other_columns(world, state, turn)
+    for free, rows in groups:
         if free or others is None:
             weights = world.once(_weights)
             columns += [
@@ -303,6 +303,12 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
         else:
             columns.append(others[:, rows[0] : rows[-1] + 1].flatten(1))
     return columns
+
+
+def _groups(world: World) -> list[tuple[bool, list[int]]]:
+    """Return the indices of bodies that follow one another and are free, or are not, and whether they are."""
+    free = [body.free for body in world.bodies]
+    return [(kind, [*rows]) for kind, rows in groupby(range(len(free)), free.__getitem__)]
 
 
 def _free_columns(body: Body, weight: list[Tensor], index: int, state: State, turn: Tensor | None) -> list[Tensor]:
