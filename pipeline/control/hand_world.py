@@ -298,7 +298,7 @@ def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body], 
     Raises:
         InputDataError: If the model has another contact law than that of cgwm.
     """
-    alone, name = World.from_model(model), free_object(model.file, task.object, task.source)
+    alone, name = World.from_model(model, joins_others=True), free_object(model.file, task.object, task.source)
     thing = alone.bodies[alone.body_names.index(name)]
     law = alone.contact
     if not isinstance(law, ContactLaw):

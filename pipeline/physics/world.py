@@ -296,15 +296,23 @@ class World:
 
     @staticmethod
     def from_model(
-        model: Model, dtype: torch.dtype = torch.float64, device: str = "cpu", geometry: World | None = None
+        model: Model,
+        dtype: torch.dtype = torch.float64,
+        device: str = "cpu",
+        geometry: World | None = None,
+        joins_others: bool = False,
     ) -> World:
         """Build the world of a fitted model.
+
+        A body that is alone on the ground has no hull: a plane touches spheres, and hulls are for what touches bodies
+        and surfaces.
 
         Args:
             model: The model.
             dtype: Type of all tensors.
             device: Device of all tensors.
             geometry: A world of the same model with other parameters, whose collision spheres are used again.
+            joins_others: Whether the bodies are to touch others than those of the model: they get their hulls.
 
         Raises:
             InputDataError: If the model has no fitted physics yet.
@@ -319,8 +327,9 @@ class World:
         def tensor(value: object) -> Tensor:
             return torch.as_tensor(np.asarray(value), dtype=dtype, device=device)[None]
 
+        hulls = joins_others or len(file.bodies) > 1 or bool(file.surfaces)
         bodies = [
-            _body(model, index, tensor, None if geometry is None else geometry.bodies[index])
+            _body(model, index, tensor, None if geometry is None else geometry.bodies[index], hulls)
             for index in range(len(file.bodies))
         ]
 
@@ -399,7 +408,9 @@ class State:
         return State(*(torch.cat([getattr(state, field.name) for state in states]) for field in fields(State)))
 
 
-def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry: Body | None) -> Body:
+def _body(
+    model: Model, index: int, tensor: Callable[[object], Tensor], geometry: Body | None, touches_others: bool
+) -> Body:
     """Return a body of a model, with the spheres and the place of `geometry` if it is given.
 
     Args:
@@ -407,6 +418,7 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         index: Index of the body in the model.
         tensor: Function that returns a value as a tensor with a batch dimension of 1.
         geometry: The same body with other parameters.
+        touches_others: Whether it may touch more than the ground.
     """
     entry = model.file.bodies[index]
     if geometry is None:
@@ -416,7 +428,8 @@ def _body(model: Model, index: int, tensor: Callable[[object], Tensor], geometry
         on_plane = hull = patch = None
         if model.file.solver.contact_model == "closed_form":  # as published, every sphere is a contact of its own
             on_plane = plane_contacts(centers[0], radii[0])
-            hull = Hull.of(centers[0], radii[0], on_plane) if entry.convex else None
+            if entry.convex and (touches_others or entry.face_points):
+                hull = Hull.of(centers[0], radii[0], on_plane)
             patch = _patch(entry, hull, centers[0], radii[0])
     else:
         centers, radii, place, on_plane = geometry.centers, geometry.radii, geometry.place, geometry.on_plane

@@ -170,7 +170,7 @@ def _path(whole: Observations, item: Segment, column: int, kind: int, std: float
     basis = np.broadcast_to(powers, (int(axes.sum()), *powers.shape))
     if kind == 0 and turned:
         # a marker beside the centre of mass turns with the body
-        turn = _filled(t, quat_to_matrix(quat).numpy(), known)[:, axes].swapaxes(0, 1)
+        turn = filled_by_cubics(t, quat_to_matrix(quat).numpy(), known)[:, axes].swapaxes(0, 1)
         basis = np.concatenate((basis, turn), 2)
     opens = item.first <= int((whole.seen[item.episode].amax(-1) > 0).to(torch.int64).argmax())
     free_s = t[0] + LIMITS.longest_burst_s * opens
@@ -191,13 +191,23 @@ def _path(whole: Observations, item: Segment, column: int, kind: int, std: float
     return path if path.free >= LEAST_FREE else None
 
 
-def _filled(times_s: Array, values: Array, known: NDArray[np.bool_]) -> Array:
-    """Return values (n, ...) at times (n,) [s], by a cubic spline through the known ones where one is not known."""
+def filled_by_cubics(times_s: Array, values: Array, known: NDArray[np.bool_]) -> Array:
+    """Return values (n, ...) at times (n,) [s]; one that is not known by Lagrange's cubic through four known ones.
+
+    They are the two nearest on each side, at the ends the four nearest.
+    """
     if known.all():
         return values
-    from scipy.interpolate import CubicSpline
-
-    return CubicSpline(times_s[known], values[known])(times_s)
+    missing, t = np.flatnonzero(~known), times_s[known]
+    first = np.clip(np.searchsorted(np.flatnonzero(known), missing) - 2, 0, len(t) - 4)
+    chosen = first[:, None] + np.arange(4)
+    own = np.eye(4, dtype=bool)
+    between = t[chosen][:, :, None] - t[chosen][:, None]
+    beyond = (times_s[missing, None] - t[chosen])[:, None]
+    weights = (np.where(own, 1.0, beyond) / np.where(own, 1.0, between)).prod(-1)
+    filled = values.copy()
+    filled[missing] = np.einsum("mk,mk...->m...", weights, values[known][chosen])
+    return filled
 
 
 def _usual(paths: Sequence[_Path]) -> float:

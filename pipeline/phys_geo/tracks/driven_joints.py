@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from torch import Tensor
 
 from ....datasets.capture.tracks import Episode, Track
@@ -417,6 +416,8 @@ def _root(information: Tensor) -> Tensor:
 
 def _first_losses(data: _Data) -> NDArray[np.float64]:
     """Return a first guess (P,): losses by the change of momentum between frames that move, 1 for factors."""
+    from scipy.optimize import nnls  # dear to import, and seldom needed
+
     tracks, driven = data.tracks, data.driven
     balance, shape = tracks.balance, tracks.values.shape
     total = sum((p.at_frames(balance, tracks, driven.grid) for p in driven.pushes), torch.zeros_like(tracks.values))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import torch
+from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.world import State, World
 from helpers.small_model import small_model
 
@@ -32,3 +33,18 @@ def test_what_depends_on_a_start_is_kept_until_the_start_is_another_one_or_is_ch
     assert world.latest(height, starts[0], times) == 1 and len(asked) == 2
     assert world.latest(height, starts[1], times) == 0 and len(asked) == 3
     assert world.latest(height, starts[0], times) == 1 and len(asked) == 4
+
+
+def test_a_convex_body_alone_on_the_ground_has_no_hull_and_moves_as_with_one() -> None:
+    model = small_model()
+    bodies = tuple(body.model_copy(update={"convex": True}) for body in model.file.bodies)
+    model = replace(model, file=model.file.model_copy(update={"bodies": bodies}))
+    bare, hulled = World.from_model(model), World.from_model(model, joins_others=True)
+    assert bare.bodies[0].hull is None and hulled.bodies[0].hull is not None
+    start = State(
+        *(torch.tensor([[x]]).double() for x in ([0.0, 0.0, 0.1], [0.8, 0.6, 0.0, 0.0], [1.0, 0, 0], [0.0] * 3))
+    )
+    times = torch.linspace(0, 0.5, 6).double()
+    moved = [rollout(world, start, times) for world in (bare, hulled)]
+    assert torch.equal(moved[0].position_m, moved[1].position_m) and moved[0].position_m[0, -1, 0, 2] < 0.09
+    assert torch.equal(moved[0].quat_wxyz, moved[1].quat_wxyz)

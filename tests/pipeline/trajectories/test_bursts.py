@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.trajectories.bursts import bursts, without_grounded_bursts
+from cgwm.pipeline.trajectories.bursts import bursts, filled_by_cubics, without_grounded_bursts
 from cgwm.pipeline.trajectories.flight_noise import without_outliers
 from cgwm.pipeline.trajectories.segmentation import cut_episodes, whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -104,3 +104,13 @@ def test_a_burst_of_a_slide_is_left_out_and_where_it_stops_nothing_is(
     else:
         assert {episode for episode, _ in lost} == {1} and len(lost) >= 3
         assert {frame for _, frame in lost} <= set(range(*wrong))
+
+
+def test_what_is_missing_of_a_cubic_is_filled_in_as_the_cubic_is_at_the_ends_too() -> None:
+    rng = np.random.default_rng(2)
+    times, powers = np.sort(rng.uniform(0, 1, 30)), rng.standard_normal((4, 2, 3))
+    true = np.tensordot(np.vander(times, 4), powers, 1)
+    known = rng.uniform(size=30) > 0.3
+    known[[0, 1, 14, 15, 16, 29]] = False
+    given = np.where(known[:, None, None], true, np.nan)
+    np.testing.assert_allclose(filled_by_cubics(times, given, known), true, atol=1e-9)
