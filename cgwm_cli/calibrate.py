@@ -81,5 +81,6 @@ def _printed(sheet: TargetSheet) -> str:
 
 def _use(folder: Path) -> str:
     from ..pipeline.calibrate.target import INTRINSICS_NAME
+    from ..schemas.printable import typed_path
 
-    return f"use them: cgwm calibrate CAPTURE --intrinsics {folder / INTRINSICS_NAME}"
+    return f"use them: cgwm calibrate CAPTURE --intrinsics {typed_path(folder / INTRINSICS_NAME)}"

@@ -217,10 +217,11 @@ def _named(text: str) -> dict[str, str]:
 
 
 def _summary(result: ImportResult) -> str:
+    from ..schemas.printable import typed_path
     from .output import warnings
 
     if result.photos and not result.episodes:
-        cameras = "with their cameras" if result.posed else f"(next: cgwm calibrate {result.capture})"
+        cameras = "with their cameras" if result.posed else f"(next: cgwm calibrate {typed_path(result.capture)})"
         return "\n".join([f"Wrote {result.capture}: {result.photos} photos {cameras}.", *warnings(result.warnings)])
     splits = ", ".join(f"{name} {count}" for name, count in result.splits.items())
     wrote = f"Wrote {result.capture}: {result.episodes} episodes ({splits}) with {result.samples} poses."

@@ -140,6 +140,7 @@ def _plan(summary: DatasetSummary | ShardsSummary) -> str:
 
 
 def _summary(summary: DatasetSummary, count: int = 1) -> str:
+    from ..schemas.printable import typed_path
     from .output import table, warnings
 
     rows = [
@@ -156,7 +157,10 @@ def _summary(summary: DatasetSummary, count: int = 1) -> str:
     head = f"{place} is up to date" if summary.up_to_date else f"Wrote {place}"
     lines = [f"{head}; cameras: {cameras}.", table(rows), *_preview(summary)]
     if count > 1 and "SLURM_JOB_ID" not in os.environ:
-        lines += [f"all {count} on SLURM: {_slurm_line(typed(), count)}", f"then: cgwm merge {summary.dataset}"]
+        lines += [
+            f"all {count} on SLURM: {_slurm_line(typed(), count)}",
+            f"then: cgwm merge {typed_path(summary.dataset)}",
+        ]
     return "\n".join([*lines, *warnings(summary.notes)])
 
 
@@ -191,6 +195,7 @@ def _slurm_line(arguments: list[str], count: int) -> str:
 
 
 def _shards_summary(summary: ShardsSummary) -> str:
+    from ..schemas.printable import typed_path
     from .output import table, warnings
 
     kept = summary.shards - summary.made
@@ -209,5 +214,5 @@ def _shards_summary(summary: ShardsSummary) -> str:
         head = f"{summary.dataset} is up to date"
     lines = [f"{head}.", table(rows), *_preview(summary)]
     if summary.shards > 1:
-        lines.append(f"to read it as one file: cgwm merge {summary.dataset}")
+        lines.append(f"to read it as one file: cgwm merge {typed_path(summary.dataset)}")
     return "\n".join([*lines, *warnings(summary.notes)])

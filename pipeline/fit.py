@@ -36,6 +36,7 @@ from ..schemas import (
     UsageError,
     read_json,
 )
+from ..schemas.printable import typed_path
 from .phys_geo.effects.requested_effects import with_effects
 from .phys_geo.images.video_checks import examine_videos
 from .phys_geo.material_pairs import require_known_pairs
@@ -297,7 +298,7 @@ def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatCon
             raise InputDataError(
                 f"{parent}: its bodies are {names}, those of {capture.root} are {capture.body_names}.",
                 "a model of this capture's bodies.",
-                f"leave --from out, or run 'cgwm fit {capture.root} --out MODEL' first.",
+                f"leave --from out, or run 'cgwm fit {typed_path(capture.root)} --out MODEL' first.",
             )
         if stage == "phys-geo":
             return model
@@ -309,7 +310,7 @@ def _start(capture: Capture, stage: Stage, parent: Path | None, config: SplatCon
             raise InputDataError(
                 f"{capture.root / 'capture.toml'}: body '{lacking[0]}' has no shape, and physics needs one.",
                 "shape = { box | sphere | mesh | splats }, or a model with spheres from photos.",
-                f"run 'cgwm fit {capture.root} --stage all --out MODEL', or pass --from MODEL.",
+                f"run 'cgwm fit {typed_path(capture.root)} --stage all --out MODEL', or pass --from MODEL.",
             )
     return _from_scene(capture, fit_scene(capture, config, checkpoint))
 

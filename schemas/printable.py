@@ -21,6 +21,18 @@ def printable(text: str) -> str:
     return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
+def typed_path(path: object) -> str:
+    r"""Return a path as it is typed in a command: in double quotes where a shell would take it apart.
+
+    >>> print(f"run 'cgwm fit {typed_path('my capture')} --out {typed_path('model')}'")
+    run 'cgwm fit "my capture" --out model'
+    """
+    text = str(path)
+    if re.fullmatch(r"[\w@%+=:,./-]+", text):
+        return text
+    return '"' + re.sub(r'([\\"$`])', r"\\\1", text) + '"'
+
+
 def printable_json(document: str) -> str:
     r"""Escape the same characters in a JSON document, whose content stays the same.
 

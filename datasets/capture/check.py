@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError, did_you_mean
+from ...schemas.printable import typed_path
 from ...schemas.regular_files import require_regular_file
 from ..shapes.meshes import mass_properties, read_mesh
 from ..shapes.ply import read_splats
@@ -150,7 +151,7 @@ def _first(faults: list[InputDataError], root: Path) -> InputDataError:
     first = faults[0]
     if len(faults) == 1:
         return first
-    more = f"({len(faults) - 1} more fault(s); 'cgwm validate {root}' lists all.)"
+    more = f"({len(faults) - 1} more fault(s); 'cgwm validate {typed_path(root)}' lists all.)"
     return InputDataError(first.found, first.allowed, f"{first.todo} {more}".strip())
 
 
@@ -288,7 +289,8 @@ def _check_labels(
         raise InputDataError(
             f"{path}: the mask has {width}x{height} px, {shown} has {size[0]}x{size[1]} px.",
             "a mask of its image's size.",
-            "make the mask at the size of the picture.",
+            "make the mask at the size of the picture"
+            + (", turned upright as its EXIF data say." if (height, width) == size else "."),
         )
     bodies = len(capture.manifest.bodies)
     if labels.max() > bodies:
@@ -399,5 +401,5 @@ def _check_video_camera(capture: CaptureFolder, camera: str, episode: str, path:
             f"{path}: {info.width}x{info.height} px, but its camera '{entry.camera}' has "
             f"{intrinsics.width}x{intrinsics.height} px.",
             "the image size that the camera was calibrated for.",
-            f"give the video in that size, or run 'cgwm calibrate {capture.root} --overwrite'.",
+            f"give the video in that size, or run 'cgwm calibrate {typed_path(capture.root)} --overwrite'.",
         )

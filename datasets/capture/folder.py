@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean
 from ...schemas.documents import shortened
+from ...schemas.printable import typed_path
 from ...schemas.regular_files import real_path, require_regular_file
 from ..shapes.meshes import Mesh, read_mesh
 from ..shapes.surfaces import surface_meshes
@@ -344,7 +345,7 @@ class CaptureFolder:
             raise InputDataError(
                 f"{self.root}: no calibrated cameras.",
                 "cameras.json, transforms.json or a COLMAP model in sparse/0.",
-                f"run 'cgwm calibrate {self.root}'.",
+                f"run 'cgwm calibrate {typed_path(self.root)}'.",
             )
         return self.cameras
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError, UsageError, did_you_mean
+from ...schemas.printable import typed_path
 from ..capture.cameras import Camera
 from ..rollouts.dataset import missing_count, read_manifest
 from ..rollouts.loader import RolloutReader
@@ -101,7 +102,7 @@ class Selection:
             raise InputDataError(
                 f"{self.path}: the frames of rollout {number} are not evenly spaced in time.",
                 "one frame rate in a rollout, which the format needs.",
-                f"'cgwm validate {self.path}' shows more; synthesize it again.",
+                f"'cgwm validate {typed_path(self.path)}' shows more; synthesize it again.",
             )
         return 1 / (step * self.every)
 

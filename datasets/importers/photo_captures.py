@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...schemas import Calibration, CameraIntrinsics, CamerasFile, CaptureManifest, InputDataError
 from ...schemas.imports import ImportResult
+from ...schemas.printable import typed_path
 from ...schemas.regular_files import require_regular_file
 from ..capture.files import entries_of
 from ..capture.images import IMAGE_SUFFIXES, image_size, write_image
@@ -51,7 +52,7 @@ def photos_in(folder: Path) -> list[Photo]:
         raise InputDataError(
             f"{folder}: no photos" + (f", but files {', '.join(others[:6])}." if others else "."),
             "photos .jpg, .jpeg, .png, .heic or .heif.",
-            f"{todo}, or with their cameras: cgwm import nerfstudio {folder}." if posed else f"{todo}.",
+            f"{todo}, or with their cameras: cgwm import nerfstudio {typed_path(folder)}." if posed else f"{todo}.",
         )
     photos = [Photo(path, f"{path.stem}.jpg" if _is_heif(path) else path.name) for path in files]
     require_distinct(photos)

@@ -35,6 +35,7 @@ from ...schemas import (
     read_toml,
 )
 from ...schemas.calibration import CalibrationAttempt, CalibrationReport, FocalFigures, ImageVerdict
+from ...schemas.printable import typed_path
 from ..runtime.work_budget import Part, within_budget
 from . import colmap
 from .attempts import MIN_PHOTOS, Candidate, check_figures, estimated, photo_count, photo_labels, search, verdict
@@ -167,7 +168,7 @@ def _open(root: Path, overwrite: bool) -> Capture:
         raise UsageError(
             f"{root} has cameras already ({len(capture.cameras.images)} images, "
             f"{len(capture.cameras.videos)} videos; scale: {capture.cameras.scale.kind}).",
-            todo=f"use them as they are, or replace them with 'cgwm calibrate {root} --overwrite'.",
+            todo=f"use them as they are, or replace them with 'cgwm calibrate {typed_path(root)} --overwrite'.",
         )
     photos = len(capture.photos())
     if photos < MIN_PHOTOS:

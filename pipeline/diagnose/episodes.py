@@ -10,6 +10,7 @@ from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode
 from ...datasets.models.model import POSE_TRACKS, Model
 from ...schemas import InputDataError
+from ...schemas.printable import typed_path
 from ..trajectories.frame_times import with_regular_times
 from ..trajectories.observations import track_episodes
 from .thresholds import THRESHOLDS
@@ -72,7 +73,7 @@ def _filmed(model: Model, capture: Capture, split: str) -> list[Episode]:
             f"{capture.root}: split '{split}' has videos and no track of a free body, and {model.root} holds no poses "
             "found in these videos.",
             f"tracks/<episode>.csv in the capture, or {POSE_TRACKS}/<episode>.csv in the model.",
-            f"run 'cgwm fit {capture.root} --supervise images --out MODEL', which looks for the poses.",
+            f"run 'cgwm fit {typed_path(capture.root)} --supervise images --out MODEL', which looks for the poses.",
         )
     return [Episode(name, model.tracks[name] | capture.tracks(name)) for name in names]
 

@@ -32,6 +32,7 @@ from ...schemas import (
     ResidualLaw,
     UsageError,
 )
+from ...schemas.printable import typed_path
 from ..physics.effects.recording import no_recording
 from ..physics.effects.registry import effect_names, effect_of, load_effect, split_units
 from ..physics.rollout_cost import durations, segment_part
@@ -313,7 +314,7 @@ def _world(model: Model, capture: Capture) -> World:
         raise InputDataError(
             f"the model's bodies are {', '.join(own)}; those of {capture.root} are {', '.join(capture.body_names)}.",
             "a model of this capture's bodies.",
-            f"run 'cgwm fit {capture.root} --out MODEL'.",
+            f"run 'cgwm fit {typed_path(capture.root)} --out MODEL'.",
         )
     refuse_paper_law(model.file, model.place, "diagnose")
     world = World.from_model(model)

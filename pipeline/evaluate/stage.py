@@ -28,6 +28,7 @@ from ...datasets.models.fit_inputs import changed_since_fit
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.loader import RolloutReader
 from ...schemas import ErrorSummary, EvalResult, InputDataError, Reference, UsageError
+from ...schemas.printable import typed_path
 from ..physics.world import World
 from ..rendering.video_view import renderable, usable_cameras
 from ..report.page_file import shows_the_same
@@ -347,7 +348,7 @@ def _cameras(model: Model, capture: Capture, episodes: Sequence[str], warnings: 
         warnings.append("no PSNR: the model has no scene, or a free body of it no visual spheres.")
         return {}
     if capture.cameras is None:
-        warnings.append(f"no PSNR: the cameras are not calibrated; run 'cgwm calibrate {capture.root}'.")
+        warnings.append(f"no PSNR: the cameras are not calibrated; run 'cgwm calibrate {typed_path(capture.root)}'.")
         return {}
     require_metric(capture.cameras)
     found = {name: usable_cameras(capture, name) for name in filmed}

@@ -15,6 +15,7 @@ from ...datasets.rollouts.dataset import read_manifest
 from ...datasets.rollouts.loader import shard_files
 from ...datasets.rollouts.rollouts import open_shard
 from ...schemas import InputDataError
+from ...schemas.printable import typed_path
 from ..validate.faults import Fault
 from ..validate.reprojection import PictureFindings, check_pictures
 from ..validate.rollout import Dataset
@@ -67,5 +68,7 @@ def _faults(chosen: Selection, dataset: Dataset, number: int) -> Iterator[Fault]
 
 def _refusal(path: Path, fault: str) -> InputDataError:
     return InputDataError(
-        f"{path}: {fault}", "a dataset without faults.", f"'cgwm validate {path}' lists them all; synthesize it again."
+        f"{path}: {fault}",
+        "a dataset without faults.",
+        f"'cgwm validate {typed_path(path)}' lists them all; synthesize it again.",
     )

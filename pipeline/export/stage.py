@@ -32,6 +32,7 @@ from ...datasets.io.progress import note, progress
 from ...datasets.models.mjcf import softer_pairs, write_mjcf
 from ...datasets.models.model import Model, read_model
 from ...schemas import ExportFormat, ExportResult, InputDataError, UsageError
+from ...schemas.printable import typed_path
 from ...schemas.quantities import MOST_DURATION_S
 from .soundness import require_sound, require_sound_files
 
@@ -358,7 +359,7 @@ def _colmap(thing: Path, out: Path, options: ExportOptions, overwrite: bool) -> 
         raise InputDataError(
             f"{thing if capture is None else capture}: contains no cameras of photos.",
             "a model whose fit refined the cameras (cameras.json), or the capture with the photos' cameras.",
-            f"cgwm export {thing} --to colmap --capture CAPTURE --out {out}",
+            f"cgwm export {typed_path(thing)} --to colmap --capture CAPTURE --out {typed_path(out)}",
         )
     photos = None if capture is None else capture / "images"
     counts = write_colmap(out, cameras, in_world(model), photos, overwrite)

@@ -25,6 +25,7 @@ from ...schemas import (
     UsageError,
     read_json,
 )
+from ...schemas.printable import typed_path
 from ..diagnose.experiments import DEFAULT, experiments_of, read_experiments
 from ..diagnose.pictures import DrawnMotion, throw_of
 from ..diagnose.stage import library_of
@@ -198,7 +199,8 @@ def _refuse_early(capture: Path, parent: Path | None, physics: PhysConfig) -> No
         raise UsageError(
             f"phys-geo.effects with a model to start from: {', '.join(physics.effects)}.",
             "the effects of that model, to which the ladder adds.",
-            f"run 'cgwm fit {capture} --from {parent} --effects NAME --out MODEL' first, and start from MODEL.",
+            f"run 'cgwm fit {typed_path(capture)} --from {typed_path(parent)} --effects NAME --out MODEL' first, and "
+            "start from MODEL.",
         )
 
 

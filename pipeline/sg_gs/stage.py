@@ -11,6 +11,7 @@ from ...datasets.capture.capture import Capture
 from ...datasets.io.progress import note
 from ...datasets.shapes.ply import Splats
 from ...schemas import CamerasFile, GroundShadow, InputDataError, SplatConfig, UsageError, Viewpoint
+from ...schemas.printable import typed_path
 from ..geometry.spheres import Spheres
 from ..rendering.contact_sheets import SHEET_BYTES, separated, small_png
 from ..runtime.checkpoint import Checkpoint
@@ -171,7 +172,7 @@ def _open(capture: Capture, config: SplatConfig, checkpoint: Checkpoint | None) 
         raise InputDataError(
             f"{capture.root}: {len(names)} photos and no cameras.",
             "cameras.json, transforms.json or a COLMAP model.",
-            f"run 'cgwm calibrate {capture.root}'.",
+            f"run 'cgwm calibrate {typed_path(capture.root)}'.",
         )
     known = [name for name in names if name in capture.cameras.images]
     if len(known) < _MIN_PHOTOS:

@@ -12,6 +12,7 @@ from ...datasets.rollouts.dataset import read_manifest
 from ...datasets.rollouts.loader import RolloutReader
 from ...datasets.rollouts.replay import Replay
 from ...schemas import InputDataError
+from ...schemas.printable import typed_path
 from .motions import Motion, can_move, own_motion, recorded_motion, replayed, still
 from .viewer import Viewer, require_viser
 
@@ -36,7 +37,9 @@ def open_view(thing: Path | str, host: str = "127.0.0.1", port: int = 8080) -> V
     kind = kind_of(path)
     if kind == "run":
         raise InputDataError(
-            f"{path}: runs of a task of control.", "their model, with --run.", f"cgwm view MODEL --run {path}."
+            f"{path}: runs of a task of control.",
+            "their model, with --run.",
+            f"cgwm view MODEL --run {typed_path(path)}.",
         )
     if kind == "dataset":
         return _dataset(path, host, port)

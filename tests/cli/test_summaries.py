@@ -139,3 +139,8 @@ def test_doctor() -> None:
     ]
     assert "  cores, memory for cgwm  2, 23.5 GiB" in lines
     assert lines[-2:] == ["What cgwm would use", "  device  cpu, 2 cores"]
+
+
+def test_a_command_with_a_path_of_several_words_can_be_typed() -> None:
+    result = ImportResult(capture="my capture", episodes=0, samples=0, splits={}, photos=12)
+    assert import_._summary(result) == 'Wrote my capture: 12 photos (next: cgwm calibrate "my capture").'

@@ -14,6 +14,7 @@ from torch import Tensor
 from ....datasets.capture.cameras import Camera
 from ....datasets.capture.capture import Capture
 from ....schemas import InputDataError
+from ....schemas.printable import typed_path
 
 MIN_FRAMES = 3
 """Minimum number of frames of a video; two show only a velocity."""
@@ -101,7 +102,7 @@ def load_footage(capture: Capture, episode: str, image_size: int, device: torch.
         raise InputDataError(
             f"{capture.root}: {len(names)} videos of episode '{episode}' and no calibrated cameras.",
             "cameras.json, transforms.json or a COLMAP model in sparse/0.",
-            f"run 'cgwm calibrate {capture.root}'.",
+            f"run 'cgwm calibrate {typed_path(capture.root)}'.",
         )
     posed = set(capture.cameras.videos)
     calibrated = [name for name in names if name in posed or f"{name}/{episode}" in posed]
@@ -110,7 +111,7 @@ def load_footage(capture: Capture, episode: str, image_size: int, device: torch.
             f"{capture.root}: none of the {len(names)} video cameras of episode '{episode}' ({', '.join(names)}) "
             f"is calibrated.",
             f"a pose under 'videos' in the cameras' file; it has {', '.join(sorted(posed)) or 'none'}.",
-            f"run 'cgwm calibrate {capture.root} --overwrite'.",
+            f"run 'cgwm calibrate {typed_path(capture.root)} --overwrite'.",
         )
     videos = tuple(_load(capture, name, episode, image_size, device) for name in calibrated)
     _require_seen(capture, episode, videos)
@@ -198,7 +199,7 @@ def _require_size_of(camera: Camera, capture: Capture, name: str, episode: str, 
         raise InputDataError(
             f"{capture.video_path(name, episode)}: frames of {frames.shape[2]}x{frames.shape[1]} pixels.",
             f"{camera.width}x{camera.height}, the size of its camera.",
-            f"film in the size that was calibrated, or run 'cgwm calibrate {capture.root} --overwrite'.",
+            f"film in the size that was calibrated, or run 'cgwm calibrate {typed_path(capture.root)} --overwrite'.",
         )
 
 

@@ -421,6 +421,8 @@ def test_mask_of_another_size(root: Path) -> None:
         "C/masks/walk/1.png: the mask has 12x8 px, images/walk/1.jpg has 24x16 px.\n"
         "Allowed: a mask of its image's size.\nNext: make the mask at the size of the picture."
     )
+    put(root / "masks" / "walk" / "1.png", label(16, 24))
+    assert "at the size of the picture, turned upright as its EXIF data say." in fault(root)
 
 
 def test_mask_label_beyond_the_bodies(root: Path) -> None:
