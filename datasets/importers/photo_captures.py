@@ -42,6 +42,14 @@ def photos_in(folder: Path) -> list[Photo]:
     Raises:
         InputDataError: If there is none, or two would have one name.
     """
+    if not folder.is_dir():
+        is_file = folder.is_file()
+        todo = f"name the folder that holds the photos (a video: cgwm import video {typed_path(folder)})."
+        raise InputDataError(
+            f"{folder}: {'is a file' if is_file else 'no such folder'}.",
+            "a folder of photos.",
+            todo if is_file else "check the path.",
+        )
     files = [path for path in entries_of(folder) if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
     if not files:
         entries = entries_of(folder)

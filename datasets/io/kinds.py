@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Literal
 
 from ...schemas import CAPTURE_FORMAT, InputDataError
+from ...schemas.printable import typed_path
 
 Kind = Literal["capture", "model", "dataset", "ladder", "run", "masks"]
 
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif")
+"""Suffixes of photos, in lower case."""
 _MARKS: dict[Kind, str] = {
     "capture": "capture.toml",
     "model": "model.json",
@@ -57,5 +60,8 @@ def refuse_other_kind(path: Path, wanted: Kind) -> None:
         )
     todo = "check the path."
     if wanted == "capture" and any((path / folder).is_dir() for folder in ("images", "videos", "tracks")):
-        todo = f"write a manifest; the shortest one: echo 'format = \"{CAPTURE_FORMAT}\"' > {path / 'capture.toml'}"
+        manifest = typed_path(path / "capture.toml")
+        todo = f"write a manifest; the shortest one: echo 'format = \"{CAPTURE_FORMAT}\"' > {manifest}"
+    elif wanted == "capture" and any(one.suffix.lower() in PHOTO_SUFFIXES for one in path.iterdir()):
+        todo = f"make a capture of its photos: cgwm import photos {typed_path(path)} --out CAPTURE"
     raise InputDataError(f"{path} is no {wanted}: it has no {_MARKS[wanted]}.", todo=todo)

@@ -582,6 +582,7 @@ def test_what_is_no_capture(root: Path, tmp_path: Path) -> None:
         "C is no capture: it has no capture.toml.\n"
         "Next: write a manifest; the shortest one: echo 'format = \"cgwm-capture/1\"' > C/capture.toml"
     )
+    assert fault(root / "images" / "walk").endswith("of its photos: cgwm import photos C --out CAPTURE")
     with pytest.raises(InputDataError) as caught:
         validate(tmp_path)
     assert str(caught.value).startswith(f"{tmp_path}: no capture, model, dataset, ladder, run or masks.")

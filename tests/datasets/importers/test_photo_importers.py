@@ -163,6 +163,11 @@ def test_photos_are_copied_and_heic_is_converted_upright_with_its_focal_length(t
     assert kept.get_ifd(0x8769)[0xA405] == 26 and 0x0112 not in kept
 
 
+def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputDataError, match="DCIM: no such folder"):
+        import_photos(tmp_path / "DCIM", tmp_path / "out")
+
+
 def test_a_photo_that_is_there_twice_is_taken_once(tmp_path: Path) -> None:
     _photos(tmp_path / "in", ["IMG 1.jpg", "IMG 2.jpg"])
     (tmp_path / "in" / "IMG 1 (1).jpg").write_bytes((tmp_path / "in" / "IMG 1.jpg").read_bytes())
@@ -273,6 +278,11 @@ def _spoil(path: Path, old: str, new: str) -> None:
 
 REFUSED = {
     "no photos": (lambda r: (r / "in").mkdir(), import_photos, "no photos."),
+    "a video in place of photos": (
+        lambda r: (r / "in").write_text("a video"),
+        import_photos,
+        "(a video: cgwm import video ",
+    ),
     "photos in a folder of it": (lambda r: (r / "in" / "images").mkdir(parents=True), import_photos, "in/images."),
     "photos with cameras": (
         lambda r: (r / "in").mkdir() or (r / "in" / "transforms.json").write_text("{}"),
