@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from ...schemas import UsageError
+from .client_page import with_whole_corners
 
 TIMEOUT_S = 10.0
 """Maximum time of the trial whether the door is closed [s]."""
@@ -137,6 +138,20 @@ def _checked(door: Door, answer: Callable[[Any, Any], Any] | None) -> Callable[[
         if reason:
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"Refused: {reason}.\n")
         request.path = door.inside(request.path)
-        return None if answer is None else answer(connection, request)
+        if answer is None or headers.get("Upgrade") == "websocket":
+            return answer and answer(connection, request)
+        with contextlib.suppress(KeyError):
+            del headers["Accept-Encoding"]  # the page is changed below
+        return _mended(answer(connection, request))
 
     return check
+
+
+def _mended(response: Any) -> Any:
+    """Return a response with the page of viser with whole corners of splats; others as they are."""
+    body = getattr(response, "body", None)
+    if body:
+        response.body = with_whole_corners(body)
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
+    return response
