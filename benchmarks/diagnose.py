@@ -4,6 +4,7 @@
     python benchmarks/diagnose.py --stage report9 --table [--record]
     python benchmarks/diagnose.py --list odd               # what is unlike the plan: noise, protocols, bodies
     python benchmarks/diagnose.py --list video             # six captures with videos only
+    python benchmarks/diagnose.py --list film              # thirty of 640 x 480 px, bodies of 40 px and more, six nulls
     python benchmarks/diagnose.py --list real-like --stage development --nulls 3 --repeats 6   # see missing_effects.py
     python benchmarks/diagnose.py --time [--device cuda]   # seconds for ten tosses of 1 s
 
@@ -57,6 +58,7 @@ from hidden_effects import (
     make_capture,
     odd_cases,
     rough_cases,
+    sharp_filmed_cases,
 )
 from real_like import STAGES as REAL_STAGES
 from store import Store, timed
@@ -71,7 +73,7 @@ FAMILIES: tuple[set[str], ...] = (
     {"rolling_resistance", "torsional_friction", "spin_damping"},
 )
 """Effects that do much the same: to name one for another is a smaller fault."""
-LISTS = ("all", "rough", "odd", "drake", "video", "real-like")
+LISTS = ("all", "rough", "odd", "drake", "video", "film", "real-like")
 RIGHT = ("exact", "class", "exact, and more", "class, and more")
 SILENT = ("none_missing", "law_inexact")
 """Verdicts that name no effect and find nothing left in flight."""
@@ -412,7 +414,8 @@ def main() -> int:
     elif given.list == "drake":
         chosen = drake_cases(given.stage, nulls=given.nulls)
     else:
-        chosen = {"rough": rough_cases, "odd": odd_cases, "video": filmed_cases}[given.list](given.stage)
+        lists = {"rough": rough_cases, "odd": odd_cases, "video": filmed_cases, "film": sharp_filmed_cases}
+        chosen = lists[given.list](given.stage)
     chosen = [case for case in chosen if given.only in case.name]
     store = Store("diagnose", given.store, given.any_commit)
     if not given.table:

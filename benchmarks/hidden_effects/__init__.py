@@ -24,6 +24,7 @@ from cgwm.datasets.synthetic.hidden_effects import (
     make_capture,
     odd_cases,
     rough_cases,
+    sharp_filmed_cases,
 )
 
 from . import drake_engine
@@ -45,4 +46,5 @@ __all__ = [
     "make_capture",
     "odd_cases",
     "rough_cases",
+    "sharp_filmed_cases",
 ]

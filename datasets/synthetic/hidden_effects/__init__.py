@@ -8,7 +8,17 @@ from . import contact, flight, measured, unknown
 from .case import Case
 from .filmed import film_capture
 from .mystery import draw_mystery, make_mystery, open_sealed
-from .plan import KNOWN, PAIRS, STAGES, UNKNOWN, cases, filmed_cases, odd_cases, rough_cases
+from .plan import (
+    KNOWN,
+    PAIRS,
+    STAGES,
+    UNKNOWN,
+    cases,
+    filmed_cases,
+    odd_cases,
+    rough_cases,
+    sharp_filmed_cases,
+)
 from .record import ENGINES, make_capture
 from .registry import EFFECTS
 
@@ -33,4 +43,5 @@ __all__ = [
     "odd_cases",
     "open_sealed",
     "rough_cases",
+    "sharp_filmed_cases",
 ]

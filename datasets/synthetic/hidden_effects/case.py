@@ -44,6 +44,8 @@ class Case:
         damping_ratio: Replaces the drawn damping ratio of the contact.
         engine: Simulator, one of `record.ENGINES`.
         filmed: Whether it is measured by two videos with masks, and has no tracks (`filmed.film_capture`).
+        film_px: Width and height of the videos.
+        film_focal_px: Focal length of their cameras.
     """
 
     name: str
@@ -73,6 +75,8 @@ class Case:
     damping_ratio: float | None = None
     engine: str = "mujoco"
     filmed: bool = False
+    film_px: tuple[int, int] = (320, 240)
+    film_focal_px: float = 420.0
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.effects if name not in EFFECTS]

@@ -26,8 +26,6 @@ from .record import make_capture
 from .rotation import rotations
 from .things import Array, Thing
 
-SIZE_PX = (320, 240)
-FOCAL_PX = 420.0
 AWAY_M, HEIGHT_M = 2.4, 1.0
 """Distance of the cameras from the world's origin, near which all paths lie [m]."""
 SUPERSAMPLED = 4
@@ -62,8 +60,8 @@ def film_capture(directory: Path, case: Case, truth: Path | None = None, overwri
 def video_cameras(case: Case) -> dict[str, Camera]:
     """Return two cameras that look at the origin from directions about a right angle apart."""
     rng = case.rng("cameras")
-    facing, (width, height) = rng.uniform(-np.pi, np.pi), SIZE_PX
-    K = np.array([[FOCAL_PX, 0, width / 2], [0, FOCAL_PX, height / 2], [0, 0, 1]])
+    facing, focal_px, (width, height) = rng.uniform(-np.pi, np.pi), case.film_focal_px, case.film_px
+    K = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
     cameras = {}
     for name, azimuth in (("left", facing), ("right", facing + rng.uniform(1.2, 1.7))):
         eye = np.array([AWAY_M * np.cos(azimuth), AWAY_M * np.sin(azimuth), HEIGHT_M])

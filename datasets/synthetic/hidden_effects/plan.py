@@ -83,6 +83,8 @@ FILMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
 )
 """Effects that are hidden in captures with videos only; the last is in no library."""
 FILM_HZ, FILM_S, FILM_TEST = 40.0, 0.5, 2
+SHARP_FILM: dict[str, Any] = {"film_px": (640, 480), "film_focal_px": 1000.0, "proportions": (1.6, 1.6, 1.6)}
+"""Larger videos of larger bodies: a ball is some 44 px wide, a box 60 px and more."""
 ODD: dict[str, tuple[Kind | None, dict[str, Any]]] = {
     "lasting": (None, {"lasting": 0.6}),
     "long_lasting": (None, {"lasting": 0.9}),
@@ -176,6 +178,18 @@ def filmed_cases(stage: Stage) -> list[Case]:
     """Return filmed cases: large effects, six training throws of 0.5 s at 40 Hz; see `cases`."""
     found = [planned_case(stage, "study", thing, names, "large", 0, "/video") for thing, names in FILMED]
     film = {"rate_hz": FILM_HZ, "length_s": FILM_S, "protocol": "throws", "test": FILM_TEST}
+    return [replace(case, filmed=True, **film) for case in found]
+
+
+def sharp_filmed_cases(stage: Stage, repeats: int = 4, nulls: int = 6) -> list[Case]:
+    """Return filmed cases with larger pictures of larger bodies, and nulls among them; see `filmed_cases`."""
+    found = [
+        planned_case(stage, "study", thing, names, "large", k, "/film")
+        for thing, names in FILMED
+        for k in range(repeats)
+    ]
+    found += [planned_case(stage, "study", THINGS[k % 2], (), "large", k, "/film") for k in range(nulls)]
+    film = {"rate_hz": FILM_HZ, "length_s": FILM_S, "protocol": "throws", "test": FILM_TEST, **SHARP_FILM}
     return [replace(case, filmed=True, **film) for case in found]
 
 

@@ -486,10 +486,10 @@ def test_a_case_is_filmed(tmp_path: Path) -> None:
             mask = read_label(tmp_path / "filmed" / "video_masks" / name / "000" / f"{frame:06d}.png")
             rows, columns = np.nonzero(mask)
             x, y, z = camera.T_world_cam[:3, :3].T @ (track.position_m[frame] - camera.T_world_cam[:3, 3])
-            middle = filmed.FOCAL_PX * np.array([x, y]) / z + np.array(filmed.SIZE_PX) / 2
+            middle = case.film_focal_px * np.array([x, y]) / z + np.array(case.film_px) / 2
             # half a pixel: the middle of pixel 0 lies at 0.5
             assert np.abs([columns.mean() + 0.5, rows.mean() + 0.5] - middle).max() < 0.15
-            assert len(rows) == pytest.approx(np.pi * (filmed.FOCAL_PX * radius / z) ** 2, rel=0.06)
+            assert len(rows) == pytest.approx(np.pi * (case.film_focal_px * radius / z) ** 2, rel=0.06)
 
 
 @pytest.mark.evidence
@@ -497,6 +497,13 @@ def test_the_filmed_cases_have_seeds_of_their_own() -> None:
     stages = [hidden_effects.filmed_cases(stage) for stage in ("development", "report")]
     assert [len(found) for found in stages] == [6, 6] and all(case.filmed for found in stages for case in found)
     assert not {case.seed for case in stages[0]} & {case.seed for case in stages[1]}
+    sharp = [hidden_effects.sharp_filmed_cases(stage) for stage in ("development", "report")]
+    assert [len(found) for found in sharp] == [30, 30] and all(case.filmed for found in sharp for case in found)
+    assert len({case.seed for found in (*stages, *sharp) for case in found}) == 72
+    for case in sharp[0]:
+        # from a camera as far away as the world's origin, the smallest width is 40 pixels and more
+        away_m = np.hypot(filmed.AWAY_M, filmed.HEIGHT_M)
+        assert 2 * case.film_focal_px * case.drawn_thing().half_extents_m.min() / away_m >= 40
 
 
 @pytest.mark.evidence
