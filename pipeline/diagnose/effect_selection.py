@@ -316,7 +316,14 @@ def _simplest_within(
         and "drag" not in best.candidate.effect.needs
         and _contains(linear, candidates, variants, other, best)
     ]
-    near = [one for one in within if _told(one) - _told(within[0]) < LIMITS.alias_chi2 and one.name not in names]
+    # its two parts may explain as much as each other, and are no rivals: each is needed, and the next step names it
+    near = [
+        one
+        for one in within
+        if _told(one) - _told(within[0]) < LIMITS.alias_chi2
+        and one.name not in names
+        and _contains(linear, candidates, variants, one, within[0])
+    ]
     return sorted([*equals, *near], key=_complexity) if near else list(equals)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -39,11 +40,11 @@ def correlation_of(names: Sequence[str], covariance: Array) -> Correlation:
 def few_covariance(information: Array, scores: Array, prior: Array | None = None) -> Array:
     """Return the covariance (P, P) of estimates from few episodes.
 
-    With `ENOUGH_EPISODES` or more it is that of the scatter between episodes (Huber 1967). With fewer, the scatter may
-    be small by chance, so each variance is at least that of the curvature, which follows from the noise. The curvature
-    alone would be far too narrow, because a model error affects all frames of an episode alike; the scatter is
-    therefore included, with the corrections for small samples (n / (n - 1), and Student's t instead of the normal
-    distribution).
+    With `ENOUGH_EPISODES` or more it is that of the scatter between episodes (Huber 1967), with the corrections for
+    small samples: n / (n - 1), and Student's t instead of the normal distribution, both of which eight episodes need.
+    With fewer, the scatter may be small by chance, so each variance is at least that of the curvature, which follows
+    from the noise. The curvature alone would be far too narrow, because a model error affects all frames of an episode
+    alike.
 
     Args:
         information: Information (P, P).
@@ -53,17 +54,15 @@ def few_covariance(information: Array, scores: Array, prior: Array | None = None
     """
     curvature = inverse(information)
     count = len(scores)
+    if count < 2:
+        return curvature
     # as a square, which rounding leaves with variances above 0 where parameters do nearly the same
-    parts = [curvature @ scores.T]
+    parts = [curvature @ scores.T * math.sqrt(count / (count - 1)) * student_quantile(0.975, count - 1) / REACH]
     if prior is not None:
         sizes, directions = np.linalg.eigh(prior)
         parts.append(curvature @ (directions * np.sqrt(sizes.clip(0.0))))
     scatter = sum((part @ part.T for part in parts), np.zeros_like(curvature))
-    if count >= ENOUGH_EPISODES:
-        return scatter
-    if count < 2:
-        return curvature
-    return _wider(curvature, count / (count - 1) * (student_quantile(0.975, count - 1) / REACH) ** 2 * scatter)
+    return scatter if count >= ENOUGH_EPISODES else _wider(curvature, scatter)
 
 
 def _wider(covariance: Array, other: Array) -> Array:

@@ -341,6 +341,27 @@ class SlowErrorThresholds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SessionThresholds:
+    """Sessions have scales of lengths of their own, which the interval of an effect allows for."""
+
+    least_episodes: int = threshold(2, "episodes", "fewest of a session that tell its scale", BY_ARGUMENT)
+    usual_scale: float = threshold(
+        3e-3,
+        "1",
+        "usual standard deviation between the scales of sessions that differ, which counts for `usual_counts` degrees "
+        "of freedom beside what flights show of it",
+        "by argument: calibrations with a board or a wand agree to some tenths of a per cent",
+    )
+    usual_counts: float = threshold(
+        1.0,
+        "sessions",
+        "degrees of freedom for which the usual standard deviation counts",
+        "by computation: with 1 the intervals of the mean over two sessions hold in 90 to 100 % for standard "
+        "deviations of 0.001 to 0.01, with 4 in 72 to 100 %",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SegmentThresholds:
     """All thresholds on segments that decide a verdict."""
 
@@ -364,6 +385,8 @@ class SegmentThresholds:
     """Whether a model describes the motion."""
     slow_errors: SlowErrorThresholds = SlowErrorThresholds()
     """Slow errors of flights."""
+    sessions: SessionThresholds = SessionThresholds()
+    """Scales of sessions."""
 
 
 SEGMENT_THRESHOLDS = SegmentThresholds()

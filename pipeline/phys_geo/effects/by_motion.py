@@ -7,7 +7,7 @@ and rolling the normal force is the weight under every law, so that the residual
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,7 @@ from ...segments.impact_fit import BASE, ImpactBase, fit_impacts
 from ...segments.impact_velocities import measured_impacts
 from ...segments.prepare import Prepared, prepare
 from ...segments.segment_fit import linearised, refit
+from ...segments.session_spread import beside_sessions
 from ...segments.sliding_descent import information_by_segment
 from ...segments.sliding_fit import StartedSliding, contact_effect_parameters, fit_sliding, nuisance_parameters
 from ...segments.slow_errors import slow_errors
@@ -42,6 +43,7 @@ def fit_effect_flights(
     episodes: Sequence[Episode],
     wanted: Sequence[tuple[Parameter, float]],
     noise: Noise,
+    groups: Mapping[str, str] | None = None,
 ) -> EffectEstimate | None:
     """Fit effects to the flights of episodes, each with its own initial state, as `cgwm diagnose` does.
 
@@ -54,6 +56,7 @@ def fit_effect_flights(
         episodes: Name and tracks by body of each episode.
         wanted: Parameters of the effects, and their start.
         noise: Noise of the tracks (position [m], rotation [rad]).
+        groups: Session of each episode that belongs to one.
 
     Returns:
         The estimate; None if there are no flights, or they do not identify all parameters.
@@ -81,16 +84,21 @@ def fit_effect_flights(
     scores = torch.stack([linear.score[episode == one].sum(0) for one in episode.unique().tolist()])
     excess = max(prepared.slow, float(linear.chi2.sum() / linear.dof.sum().clamp_min(1.0)), 1.0)
     covariance = few_covariance(information / excess + prior, scores.numpy() / excess, prior)
+    values = found.values
+    sessions = [(groups or {}).get(prepared.names[item.episode], "") for item in prepared.flight.items]
+    beside = beside_sessions(found.segments[0], names, values, sessions, excess)
+    if beside is not None:
+        values, covariance = torch.from_numpy(beside.values).to(values), beside.covariance
     with np.errstate(invalid="ignore"):
         std = np.sqrt(np.diag(covariance))
     share = SEGMENT_THRESHOLDS.preparation.unobservable_share
     # of effects that do the same, rounding leaves no variance at all
     if not all(s <= share * p.prior[1] for s, p in zip(std, names, strict=True)):
         return None
-    parameters = tuple(
-        fitted_parameter(p, float(z), float(s)) for p, z, s in zip(names, found.values, std, strict=True)
-    )
+    parameters = tuple(fitted_parameter(p, float(z), float(s)) for p, z, s in zip(names, values, std, strict=True))
     record = {"flights": len(prepared.flight.items), "costs": [found.cost], "chi2": excess}
+    if beside is not None:
+        record["session_scales_std"] = beside.spread
     if slow is not None:
         record["slow_errors"] = {
             "position_std_m": slow.position_m(prepared.noise.position_m),
@@ -99,7 +107,7 @@ def fit_effect_flights(
         }
     correlation = correlation_of([p.name for p in names], covariance)
     return EffectEstimate(
-        world=placed(world, names, found.values), parameters=parameters, record=record, correlations=(correlation,)
+        world=placed(world, names, values), parameters=parameters, record=record, correlations=(correlation,)
     )
 
 

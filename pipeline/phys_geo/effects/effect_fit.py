@@ -59,7 +59,7 @@ def fit_effects(
 
     progress = _Progress(world, [*others, *contact], list(along), {})
     if others:
-        progress = progress.with_flights(episodes, others, noise)
+        progress = progress.with_flights(episodes, others, noise, groups or {})
     if contact:
         progress = progress.with_contacts(episodes, contact, noise)
     if progress.missing:
@@ -80,9 +80,11 @@ class _Progress:
     parts: dict[str, EffectEstimate]
     """Estimates by the key of the kind of motion in `fit.json`."""
 
-    def with_flights(self, episodes: Episodes, names: Sequence[str], noise: Noise) -> _Progress:
+    def with_flights(
+        self, episodes: Episodes, names: Sequence[str], noise: Noise, groups: Mapping[str, str]
+    ) -> _Progress:
         """Add the effects that act in flight, if flights identify all of them."""
-        flown = _best(self.world, names, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise))
+        flown = _best(self.world, names, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise, groups))
         if flown is None:
             return self
         # these estimates are final: in contact the errors of the contact law would bias them

@@ -1,7 +1,9 @@
 """Scales of lengths that differ between sessions: they are no scatter of effects, and no vertical force."""
 
+from dataclasses import replace
+
 import pytest
-from cgwm.pipeline.diagnose.effect_selection import select_next
+from cgwm.pipeline.diagnose.effect_selection import _simplest_within, select_next
 from cgwm.pipeline.diagnose.falsification import repetition
 from cgwm.pipeline.diagnose.score_test import score_test
 from cgwm.pipeline.diagnose.session_scales import NAME, linearize_beside_scales, scale_spread
@@ -52,6 +54,19 @@ def test_a_tilt_and_a_scale_are_no_constant_force_alone() -> None:
     assert prepared.flight is not None
     step = select_next(prepared.flight, world, CANDIDATES, GROUPS, True)  # pyright: ignore[reportArgumentType]
     assert [one.name for one in step.equals] == ["gravity_tilt", "constant_force"]
+
+
+def test_two_halves_of_a_force_that_explain_as_much_as_each_other_are_no_rivals() -> None:
+    prepared, world = recorded((0.0, 0.0), {"constant_force": {"f_x": 0.1, "f_y": 0.0, "f_z": 0.1}})
+    assert prepared.flight is not None
+    step = select_next(prepared.flight, world, CANDIDATES, GROUPS, True)  # pyright: ignore[reportArgumentType]
+    found = {one.name: one for one in step.evidence}
+    best, equal = found["constant_force"], replace(found["gravity_tilt"], delta_bic=found["gravity_scale"].delta_bic)
+    assert best.delta_bic is not None and equal.delta_bic is not None and best.delta_bic < equal.delta_bic
+    variants = variants_of(CANDIDATES, prepared.flight.world.gravity[0, :1])
+    linear = linearize(prepared.flight, prepared.flight.world, variants, GROUPS, robust=False)
+    within = _simplest_within([best], [best, found["gravity_scale"], equal], linear, CANDIDATES, variants)
+    assert [one.name for one in within] == ["gravity_scale", "constant_force"]
 
 
 def test_two_sessions_that_agree_hardly_tell_how_far_sessions_scatter() -> None:

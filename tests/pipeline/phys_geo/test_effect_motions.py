@@ -110,7 +110,8 @@ def test_what_no_episode_shows_keeps_the_width_of_its_prior() -> None:
     information, prior = np.diag([100.0, 0.0]), np.diag([0.0, 4.0])
     scores = np.array([[10.0, 0.0], [-10.0, 0.0]] * 5)
     covariance = uncertainty.few_covariance(information + prior, scores, prior)
-    assert covariance[0, 0] == pytest.approx(10 * 100 / 1e4) and covariance[1, 1] == pytest.approx(0.25)
+    assert covariance[0, 0] == pytest.approx(10 * 100 / 1e4 * 10 / 9 * (2.2622 / 1.96) ** 2, rel=1e-3)
+    assert covariance[1, 1] == pytest.approx(0.25)
 
 
 def test_a_number_that_windows_hardly_show_ends_on_no_bound() -> None:
