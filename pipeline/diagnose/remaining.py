@@ -22,6 +22,7 @@ from ..segments.contact_phases import PHASES, PhaseName, contact_phases
 from ..segments.prepare import whole_flights
 from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
+from ..segments.sliding_fit import StartedSliding, nuisance_parameters
 from ..trajectories.innovations import WHITE
 from .evidence import Evidence
 from .flight_findings import FlightFindings
@@ -117,10 +118,45 @@ def misfits_of(contact: Segments) -> list[PhaseMisfit]:
     return sorted(found, key=lambda one: -one.reduced_chi2)
 
 
+def slides_of(sliding: StartedSliding | None) -> list[PhaseMisfit]:
+    """Return how one friction describes whole slides; empty where none moves.
+
+    A friction that changes from place to place bends long slides, of which pieces of a tenth of a second show nothing.
+    """
+    if sliding is None:
+        return []
+    found, seen = sliding.base, sliding.base.segments.observations
+    least = LIMITS.moved_sigmas * found.segments.noise.position_m
+    last = [seen.position_m[k, n - 1, 0] for k, n in enumerate(found.segments.lengths)]
+    moved = [k for k, at in enumerate(last) if float((at - seen.position_m[k, 0, 0]).norm()) > least]
+    if not moved:
+        return []
+    chosen = found.segments.select(moved)
+    parameters = nuisance_parameters(chosen.world, sliding.flight_parameters)
+    rows = chosen.residuals(parameters, found.values[0], jacobian=False)[0]
+    dof = chosen.dof.clamp_min(1.0)
+    one = _misfit("sliding", chosen, found.chi2[moved] / dof, rows)
+    own = sliding.separate.chi2[moved] / dof
+    if float(own.median()) < 0.5 * one.reduced_chi2:
+        low, high = sliding.separate.values[moved, 0].exp().quantile(own.new_tensor([0.1, 0.9])).tolist()
+        text = (
+            f"{_OTHER_PLACES}: with a friction of its own, most of {low:.2g} to {high:.2g}, each of these is described"
+        )
+        return [one.model_copy(update={"then": text})]
+    return [one]
+
+
+_OTHER_PLACES = "record the same slide across different places of the ground, from both sides and at two speeds"
+
+
 def bad_ones(misfits: Sequence[PhaseMisfit]) -> list[PhaseMisfit]:
     """Return the phases that the law of contact does not describe, the worst first."""
-    least, most = LIMITS.misfit_segments, LIMITS.misfit_chi2
-    return [one for one in misfits if one.segments >= least and one.reduced_chi2 > most]
+    return [one for one in misfits if one.segments >= LIMITS.misfit_segments and one.reduced_chi2 > _most(one)]
+
+
+def _most(one: PhaseMisfit) -> float:
+    """Return the chi2 per degree of freedom above which a phase is badly described."""
+    return LIMITS.slide_chi2 if one.segment_s >= LIMITS.slide_s else LIMITS.misfit_chi2
 
 
 def _cause(phases: Sequence[PhaseName]) -> PhaseName:

@@ -164,6 +164,16 @@ class VerdictThresholds:
         "segments are above it",
         "by argument: an error of three standard deviations of the noise is seen by eye in a plot",
     )
+    slide_chi2: float = threshold(
+        4.0,
+        "chi2 / dof",
+        "the same of segments of `slide_s` and more: an error that lasts so long is seen at two standard deviations",
+        "by argument",
+    )
+    slide_s: float = threshold(0.2, "s", "length of such segments: those of contact last half as long", BY_ARGUMENT)
+    moved_sigmas: float = threshold(
+        20.0, "sigma", "way from the first to the last frame of a slide that moves", BY_ARGUMENT
+    )
     misfit_segments: int = threshold(4, "segments", "fewest segments of such a phase", BY_ARGUMENT)
     omnibus_s: tuple[float, ...] = threshold(
         (0.3, 0.15), "s", "lengths of the pieces of flight for that test: slow forces and short ones"

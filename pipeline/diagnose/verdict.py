@@ -21,7 +21,7 @@ from .evidence import Evidence
 from .flight_findings import FlightFindings, flight_findings
 from .flight_omnibus import is_significant
 from .other_forms import OtherForms
-from .remaining import bad_ones, misfits_of
+from .remaining import bad_ones, misfits_of, slides_of
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict
@@ -94,7 +94,9 @@ def find(
     limits = THRESHOLDS.segments
     contact = _without_useless(contact, limits.confirmed if flown.remains or flown.own else -limits.worse_t)
     in_contact = any(one.where == "contact" for one in contact.chosen)
-    misfits = () if contact.segments is None or in_contact else misfits_of(contact.segments)
+    misfits = [] if contact.segments is None or in_contact else misfits_of(contact.segments)
+    if not in_contact:
+        misfits = sorted([*misfits, *slides_of(contact.sliding)], key=lambda one: -one.reduced_chi2)
     verdict = _verdict(contact.chosen, flown)
     if verdict == "none_missing" and bad_ones(misfits):
         verdict = "law_inexact"
