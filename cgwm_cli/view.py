@@ -21,8 +21,8 @@ def view(
     ],
     run: Annotated[
         Path | None,
-        typer.Option("--run", metavar="RUN", help="Runs of 'cgwm control' with this model, to replay.",
-                     show_default=False),
+        typer.Option("--run", metavar="RUN", help="Runs of 'cgwm control' with this model, to replay, or to follow "
+                     "while they go on.", show_default=False),
     ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port to listen on; 0: any free one.")] = 8080,
     host: Annotated[
@@ -44,9 +44,10 @@ def view(
             if run is None:
                 viewer = ends.enter_context(open_view(thing, host, port))
             else:
-                from ..pipeline.control import replays_of
+                from ..pipeline.control import replays_or_following
 
-                viewer = ends.enter_context(open_replays(f"run {run.name}", *replays_of(thing, run), host, port))
+                shown, motions, more = replays_or_following(thing, run)
+                viewer = ends.enter_context(open_replays(f"run {run.name}", shown, motions, host, port, more))
             emit(ViewReport(url=viewer.url, showing=str(thing)), _summary)
         with until_interrupted():
             if open_:

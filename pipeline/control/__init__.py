@@ -4,7 +4,7 @@ from .closed_loop import ClosedLoop, Reach, Targets, Velocity
 from .controller import Controller
 from .hand_controller import HandController
 from .planning import ControlPlan, ControlState
-from .replay import replays_of
+from .replay import Following, replays_of, replays_or_following
 from .stage import control
 
 __all__ = [
@@ -12,10 +12,12 @@ __all__ = [
     "ControlPlan",
     "ControlState",
     "Controller",
+    "Following",
     "HandController",
     "Reach",
     "Targets",
     "Velocity",
     "control",
     "replays_of",
+    "replays_or_following",
 ]

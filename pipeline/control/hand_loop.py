@@ -13,7 +13,7 @@ from ..geometry.rotation import quat_multiply, quat_turn
 from .hand_controller import HandController
 from .hand_plant import HandPlant, HandTruth
 from .horizon import Array
-from .loop import Commander, Recording, Sensor
+from .loop import Commander, Recording, Sensor, Watch, unwatched
 
 
 def hand_start(task: HandTask, seed: int) -> tuple[Array, Array]:
@@ -42,7 +42,9 @@ def goals_of(task: HandTask, seed: int) -> Iterator[Array]:
             yield drawn
 
 
-def run_hand(controller: HandController, plant: HandPlant, seed: int, clock: ClockName) -> Recording:
+def run_hand(
+    controller: HandController, plant: HandPlant, seed: int, clock: ClockName, watch: Watch = unwatched
+) -> Recording:
     """Run a task for a hand from a seed; clocks as in `loop.run`.
 
     Args:
@@ -50,6 +52,7 @@ def run_hand(controller: HandController, plant: HandPlant, seed: int, clock: Clo
         plant: The plant.
         seed: Seed of start, goals, noise and plans.
         clock: real or ideal.
+        watch: Is told of the recording after each command; no clock charges it.
     """
     task, interval = controller.task, controller.interval_s
     controller.restart(seed)
@@ -75,6 +78,7 @@ def run_hand(controller: HandController, plant: HandPlant, seed: int, clock: Clo
         within, since = within + interval if good else 0.0, since + interval
         reached = good and within >= task.success.hold_s - 1e-9
         _note_command(recording, controller, now, (before, truth), command, goal, (*errors, float(reached)))
+        watch(recording)
         if reached:
             recording.goals += 1
             if recording.goals >= task.success.goals:

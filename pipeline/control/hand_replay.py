@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,41 +10,40 @@ from ...datasets.io.atomic import sha256
 from ...datasets.models.model import Model
 from ...datasets.rollouts.control_file import RunTables
 from ...datasets.rollouts.replay import Replay
-from ...schemas import ControlResult, HandTask, InputDataError
+from ...schemas import HandTask, InputDataError
 from .film import AHEAD_S, predicted_at
-from .hand_film import dotted_model
 from .hand_world import HandWorld, hand_world
 from .horizon import Array
 from .replayed_states import replay_of
 
 
-def hand_replays(
-    model: Model, task: HandTask, file: ControlResult, runs: Sequence[RunTables]
-) -> tuple[Model, dict[str, Replay]]:
-    """Return the model with the hand in it, and the motions of runs, by name.
+def hand_of_runs(model: Model, task: HandTask, source: str, hashes: Mapping[str, str]) -> HandWorld:
+    """Return the hand of runs.
 
     Args:
         model: The model that the runs are of.
         task: Their task.
-        file: Their document, which has the path of the task and the hash of the hand's file.
-        runs: The runs.
+        source: The path of its file.
+        hashes: SHA-256 of the files that they were made of, by name.
 
     Raises:
         InputDataError: If the file of the hand is not where it was, or is not the same.
     """
-    task._source = file.task
-    _require_same(task, file)
-    hand = hand_world(model, task)
-    ahead = min(AHEAD_S, task.planner.horizon_s)
-    motions = {}
-    for run in runs:
-        actual = run.arrays["obs/object"]
-        motions[f"seed {run.seed}"] = _replay(hand, run, actual)
-        motions[f"seed {run.seed}, predicted {ahead:g} s before"] = _replay(hand, run, _predicted(run, actual, ahead))
-    return dotted_model(hand), motions
+    task._source = source
+    _require_same(task, hashes)
+    return hand_world(model, task)
 
 
-def _require_same(task: HandTask, file: ControlResult) -> None:
+def hand_replays(hand: HandWorld, run: RunTables) -> dict[str, Replay]:
+    """Return the motions of a run, by name; see :func:`hand_film.dotted_model` for what they move."""
+    ahead, actual = min(AHEAD_S, hand.task.planner.horizon_s), run.arrays["obs/object"]
+    return {
+        f"seed {run.seed}": _replay(hand, run, actual),
+        f"seed {run.seed}, predicted {ahead:g} s before": _replay(hand, run, _predicted(run, actual, ahead)),
+    }
+
+
+def _require_same(task: HandTask, hashes: Mapping[str, str]) -> None:
     """Check that the file of the hand is that of the runs: links of another would be shown in wrong places."""
     path = task.folder / task.robot.file
     if not path.is_file():
@@ -53,7 +52,7 @@ def _require_same(task: HandTask, file: ControlResult) -> None:
             "the hand's file where it was, beside the task.",
             "call this from the directory in which 'cgwm control' ran, or put the file back.",
         )
-    known = file.input_sha256.get(task.robot.file)
+    known = hashes.get(task.robot.file)
     if known is not None and sha256(path) != known:
         raise InputDataError(
             f"{path}: the hand is not that of these runs.",

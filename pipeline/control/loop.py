@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
@@ -48,6 +49,21 @@ class Recording:
         table = getattr(self, of)
         for name, value in row.items():
             table.setdefault(name, []).append(value)
+
+    def last(self, commands: int) -> Recording:
+        """Return the recording with the last rows alone: of some commands, and of as many plans."""
+        commands_kept, plans_kept = (
+            {name: rows[-commands:] for name, rows in table.items()} for table in (self.commands, self.plans)
+        )
+        return replace(self, commands=commands_kept, plans=plans_kept)
+
+
+Watch = Callable[[Recording], None]
+"""Is told of the recording after each command."""
+
+
+def unwatched(recording: Recording) -> None:
+    """Do nothing: runs that nobody watches."""
 
 
 class Measured(Protocol):
@@ -109,7 +125,7 @@ class Sensor:
         return first.towards(second, (time_s - first.time_s) / (second.time_s - first.time_s))
 
 
-def run(controller: Controller, plant: Plant, seed: int, clock: ClockName) -> Recording:
+def run(controller: Controller, plant: Plant, seed: int, clock: ClockName, watch: Watch = unwatched) -> Recording:
     """Run a task from a seed.
 
     With the real clock a plan is made from the state at a command, and acts from the next command after the wall time
@@ -121,6 +137,7 @@ def run(controller: Controller, plant: Plant, seed: int, clock: ClockName) -> Re
         plant: The plant.
         seed: Seed of start, noise and plans.
         clock: real or ideal.
+        watch: Is told of the recording after each command; no clock charges it.
 
     Raises:
         InputDataError: If something begins inside of something else.
@@ -143,6 +160,7 @@ def run(controller: Controller, plant: Plant, seed: int, clock: ClockName) -> Re
             break
         errors = _errors(controller, truth)
         _note_command(recording, controller, now, (before, truth), command, errors)
+        watch(recording)
         good = errors[0] <= task.success.position_m and errors[1] <= task.success.turn_deg
         within = within + interval if good else 0.0
         if good and within >= task.success.hold_s - 1e-9:

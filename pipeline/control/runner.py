@@ -19,7 +19,7 @@ from .hand_loop import goals_of, hand_errors, hand_start, run_hand
 from .hand_plant import HandModelPlant, HandPlant, HandScenePlant
 from .hand_tables import hand_tables_of
 from .hand_world import hand_world
-from .loop import Measured, Recording, run
+from .loop import Measured, Recording, Watch, run, unwatched
 from .mujoco_plant import MujocoPlant
 from .planning import PlanningController
 from .plant import ModelPlant, Plant, start_of
@@ -48,8 +48,8 @@ class Runner(Protocol):
         """
         ...
 
-    def run(self, seed: int, clock: ClockName) -> Recording:
-        """Run the task from a seed."""
+    def run(self, seed: int, clock: ClockName, watch: Watch = unwatched) -> Recording:
+        """Run the task from a seed; `watch` is told of the recording after each command."""
         ...
 
     def tables(self, recording: Recording, timed: bool) -> RunTables:
@@ -108,9 +108,9 @@ class PushRunner:
         """See :class:`Runner`."""
         return self.plant.reset(*start_of(self.controller.task_world, seed))
 
-    def run(self, seed: int, clock: ClockName) -> Recording:
+    def run(self, seed: int, clock: ClockName, watch: Watch = unwatched) -> Recording:
         """See :class:`Runner`."""
-        return run(self.controller, self.plant, seed, clock)
+        return run(self.controller, self.plant, seed, clock, watch)
 
     def tables(self, recording: Recording, timed: bool) -> RunTables:
         """See :class:`Runner`."""
@@ -150,9 +150,9 @@ class HandRunner:
         """See :class:`Runner`."""
         return self.plant.reset(*hand_start(self.controller.task, seed))
 
-    def run(self, seed: int, clock: ClockName) -> Recording:
+    def run(self, seed: int, clock: ClockName, watch: Watch = unwatched) -> Recording:
         """See :class:`Runner`."""
-        return run_hand(self.controller, self.plant, seed, clock)
+        return run_hand(self.controller, self.plant, seed, clock, watch)
 
     def tables(self, recording: Recording, timed: bool) -> RunTables:
         """See :class:`Runner`."""

@@ -17,7 +17,7 @@ from ...datasets.io.outputs import reads, refuse_output
 from ...datasets.io.progress import note
 from ...datasets.models.fit_inputs import versions
 from ...datasets.models.model import Model, read_model
-from ...datasets.rollouts.control_file import RunTables, write_runs
+from ...datasets.rollouts.control_file import write_runs
 from ...schemas import (
     AnyTask,
     ClockName,
@@ -35,6 +35,7 @@ from ...schemas import (
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
 from ..runtime.resources import no_garbage_search
+from .noted_runs import NOW, kept_tables, noting, seed_slot, tables_kept
 from .page import FILM, PAGE, PageRun, control_html
 from .runner import Runner, planning_world, runner_of
 from .tables import figures_of
@@ -149,7 +150,7 @@ def control(
             _require_speed(runner, request.task)
         checkpoint = Checkpoint.beside(out, made_of, resume, overwrite, "a run")
         try:
-            runs = [_run(runner, seed, clock, checkpoint) for seed in range(seeds)]
+            runs = [_run(runner, seed, clock, checkpoint, str(task)) for seed in range(seeds)]
             result = _write(out, request, runner, runs, (str(model), str(task)), overwrite)
         except KeyboardInterrupt:
             raise InterruptedWork(f"{checkpoint.path} holds the runs that ended; --resume goes on with them.") from None
@@ -186,30 +187,21 @@ def _require_speed(runner: Runner, task: AnyTask) -> None:
         )
 
 
-def _run(runner: Runner, seed: int, clock: ClockName, checkpoint: Checkpoint) -> PageRun:
+def _run(runner: Runner, seed: int, clock: ClockName, checkpoint: Checkpoint, source: str) -> PageRun:
     """Return a run from its checkpoint; it is made first if there is none."""
-    slot = checkpoint.slot(f"seed {seed}")
+    slot = checkpoint.slot(seed_slot(seed))
     kept = slot.read(torch.device("cpu"))
     if kept is None:
         note(f"control: seed {seed}")
+        watch = noting(runner, checkpoint.slot(NOW), source)
         with no_garbage_search():
-            recording = runner.run(seed, clock)
+            recording = runner.run(seed, clock, watch)
         tables = runner.tables(recording, clock == "real")
         figures = figures_of(recording, tables, runner.start_errors(seed), runner.controller.interval_s)
-        arrays = {name: torch.as_tensor(values) for name, values in tables.arrays.items()}
-        kept = {
-            "figures": figures.model_dump_json(),
-            "ended": recording.ended,
-            "arrays": arrays,
-            "robot": tables.robot,
-            "joints": list(tables.joints),
-        }
+        kept = {"figures": figures.model_dump_json(), **kept_tables(tables, source)}
         slot.write(kept)
     figures = ControlRun.model_validate_json(kept["figures"])
-    arrays = {name: values.numpy() for name, values in kept["arrays"].items()}
-    names = tuple(kept["joints"])
-    tables = RunTables(seed=seed, ended=kept["ended"], arrays=arrays, robot=kept["robot"], joints=names)
-    return PageRun(figures=figures, tables=tables)
+    return PageRun(figures=figures, tables=tables_kept(kept))
 
 
 def _write(

@@ -51,6 +51,11 @@ class Checkpoint:
         self._last = time.monotonic()
 
     @staticmethod
+    def of(out: Path, made_of: Mapping[str, str]) -> Checkpoint:
+        """Return the checkpoints of the work that writes `out`, whatever is there."""
+        return Checkpoint(out.with_name(f"{out.name}.checkpoint"), made_of)
+
+    @staticmethod
     def beside(out: Path, made_of: Mapping[str, str], resume: bool, overwrite: bool, work: str = "a fit") -> Checkpoint:
         """Return the checkpoints of the work that writes `out`; existing ones are kept if it resumes.
 
@@ -58,7 +63,7 @@ class Checkpoint:
             UsageError: If the directory exists and holds no checkpoints, if it does and neither `resume` nor
                 `overwrite` is set, or if the fit to resume had other settings or inputs.
         """
-        checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), made_of)
+        checkpoint = Checkpoint.of(out, made_of)
         path = checkpoint.path
         if not path.exists():
             return checkpoint
@@ -84,7 +89,7 @@ class Checkpoint:
     @staticmethod
     def remove_of(out: Path, made_of: Mapping[str, str]) -> None:
         """Remove the checkpoints of a complete model `out`, but not those of a fit that is made of something else."""
-        checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), made_of)
+        checkpoint = Checkpoint.of(out, made_of)
         if checkpoint._is_torn():
             shutil.rmtree(checkpoint.path)
         elif not checkpoint._differing():
@@ -141,12 +146,16 @@ class Checkpoint:
             return False
         return all(_OWN.fullmatch(entry.name) for entry in self.path.iterdir())
 
-    def _differing(self) -> list[str]:
+    def stored(self) -> dict[str, Any]:
+        """Return what the checkpoints that are there were made of; nothing where none can be read."""
         try:
             found = json.loads((self.path / _KEY).read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
             found = {}
-        found = found if isinstance(found, dict) else {}
+        return found if isinstance(found, dict) else {}
+
+    def _differing(self) -> list[str]:
+        found = self.stored()
         return sorted(name for name in {*found, *self._made_of} if found.get(name) != self._made_of.get(name))
 
     def _refuse_others(self) -> None:
@@ -164,6 +173,11 @@ class Slot:
 
     def __init__(self, checkpoint: Checkpoint, name: str) -> None:
         self._checkpoint, self._name = checkpoint, name
+
+    @property
+    def path(self) -> Path:
+        """Its file."""
+        return self._checkpoint.path / _file_name(self._name)
 
     def read(self, device: torch.device) -> State | None:
         """Return the last written state; None where there is none."""

@@ -54,7 +54,12 @@ def open_view(thing: Path | str, host: str = "127.0.0.1", port: int = 8080) -> V
 
 
 def open_replays(
-    title: str, model: Model, motions: Mapping[str, Replay], host: str = "127.0.0.1", port: int = 8080
+    title: str,
+    model: Model,
+    motions: Mapping[str, Replay],
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    more: Callable[[], Mapping[str, Replay]] | None = None,
 ) -> Viewer:
     """Start a server that shows motions of a model, such as those of `pipeline.control.replays_of`.
 
@@ -64,13 +69,18 @@ def open_replays(
         motions: The motions, by name.
         host: Address to listen on.
         port: Port to listen on; 0 takes a free one.
+        more: Returns the motions that are new or longer than at its last call, by name; of motions that go on.
 
     Raises:
         UsageError: If viser is not installed, or the address is not available.
     """
     require_viser()
-    made = {name: partial(replayed, motion) for name, motion in motions.items()}
-    return Viewer(title, model, made, host, port, playing=True)
+
+    def made_of(given: Mapping[str, Replay]) -> dict[str, Callable[[], Motion]]:
+        return {name: partial(replayed, motion) for name, motion in given.items()}
+
+    follow = None if more is None else lambda: made_of(more())
+    return Viewer(title, model, made_of(motions), host, port, playing=True, follow=follow)
 
 
 def _dataset(path: Path, host: str, port: int) -> Viewer:

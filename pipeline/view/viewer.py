@@ -35,6 +35,8 @@ from .scene_nodes import (
 
 SPEEDS = {"as it was": 1.0, "3 times slower": 1 / 3, "10 times slower": 0.1}
 _MOST_UPDATES_HZ = 30.0
+FOLLOW_S = 0.5
+"""Time between two looks at motions that go on [s]."""
 _SEE_THROUGH = 0.12
 """Factor on the opacities of see-through bodies; it is small because several spheres lie behind each other."""
 _OVERVIEW = "overview"
@@ -68,6 +70,8 @@ class Viewer:
         host: Address to listen on.
         port: Port to listen on; 0 takes a free one.
         playing: Play from the beginning.
+        follow: Returns the motions that are new or longer than at its last call, the present one first: what is shown
+            goes on to its end, and waits there for more.
 
     Raises:
         UsageError: If viser is not installed, or the address is not available.
@@ -82,15 +86,17 @@ class Viewer:
         host: str,
         port: int,
         playing: bool = False,
+        follow: Callable[[], Mapping[str, Callable[[], Motion]]] | None = None,
     ) -> None:
         viser = require_viser()
         port = _free_port(host, port)
-        self._made = dict(motions)
+        self._made, self._follow = dict(motions), follow
         self._kept: dict[str, Motion] = {}
         self._lock = threading.RLock()
         self._shapes = shapes_of(model)
         self._size_m = radius_m(model, self._shapes)
         self._first, self._motion = self._first_motion()
+        self._present = self._first
         self._playing = playing and len(self._motion.times_s) > 1
         door = Door(host)
         with contextlib.redirect_stdout(io.StringIO()), guarded(door, host):  # its banner is not shown
@@ -118,14 +124,40 @@ class Viewer:
 
     def run(self) -> None:
         """Play while playback is on; ends only by an exception, such as KeyboardInterrupt."""
+        looked_s = time.monotonic()
         while True:
+            if self._follow is not None and time.monotonic() - looked_s > FOLLOW_S:
+                self.follow()
+                looked_s = time.monotonic()
             times_s = self._motion.times_s
             pace = SPEEDS[self._speed.value]
             step_s = float(times_s[-1] - times_s[0]) / max(1, len(times_s) - 1) / pace
             stride = max(1, math.ceil(1 / (_MOST_UPDATES_HZ * step_s))) if step_s > 0 else 1
             time.sleep(max(step_s * stride, 1 / _MOST_UPDATES_HZ))
             if self._playing and len(times_s) > 1:
-                self._frame.value = (self._frame.value + stride) % len(times_s)  # shows it, too
+                after = self._frame.value + stride
+                # shows it, too; what goes on is not begun again at its end
+                self._frame.value = after % len(times_s) if self._follow is None else min(after, len(times_s) - 1)
+
+    def follow(self) -> None:
+        """Take what has been added to the motions; the time that is shown stays."""
+        added = {} if self._follow is None else dict(self._follow())
+        if not added:
+            return
+        with self._lock:
+            chosen, known, before = self._choice.value, list(self._made), self._present
+            self._made |= added
+            self._present = next(iter(added))
+            for name in added:
+                self._kept.pop(name, None)
+            if list(self._made) != known:
+                self._choice.options = list(self._made)
+            if chosen == before != self._present:
+                self._choice.value = self._present  # shows it, too
+            elif chosen in added:
+                shown_s = self._motion.times_s[min(self._frame.value, len(self._motion.times_s) - 1)]
+                times_s = self._load(chosen).times_s
+                self._begin(self._load(chosen), min(int(np.searchsorted(times_s, shown_s - 1e-9)), len(times_s) - 1))
 
     def _first_motion(self) -> tuple[str, Motion]:
         """Return the first motion that can be made, with its name: a simulation may diverge."""
@@ -180,8 +212,8 @@ class Viewer:
         self._cameras: dict[str, Any] = {}
         self._marks: list[Any] = []
 
-    def _begin(self, motion: Motion) -> None:
-        """Add what belongs to a motion as a whole (cameras, number of marks, controls) to the scene."""
+    def _begin(self, motion: Motion, frame: int = 0) -> None:
+        """Add what belongs to a motion as a whole (cameras, number of marks, controls), and show one of its frames."""
         with self._lock, self.server.atomic():
             self._motion = motion
             for handle in [*self._cameras.values(), *self._marks]:
@@ -198,10 +230,10 @@ class Viewer:
             self._frame.max, self._frame.disabled, self._play.disabled = last, alone, alone
             self._contacts.visible = self._arrow_note.visible = motion.contacts_known
             self._arrow_note.content = _legend(motion.largest_impulse_n_s)
-            if self._frame.value != 0:
-                self._frame.value = 0
+            if self._frame.value != frame:
+                self._frame.value = frame
             else:
-                self._show(0)
+                self._show(frame)
 
     def _show(self, frame: int) -> None:
         with self._lock, self.server.atomic():
@@ -231,7 +263,8 @@ class Viewer:
         gui.main_panel.dock_right()
         aside.dock_below(gui.main_panel)
         with aside.add_tab("Show"):
-            self._speed = gui.add_dropdown("speed", list(SPEEDS), initial_value="3 times slower")
+            pace = list(SPEEDS)[1 if self._follow is None else 0]
+            self._speed = gui.add_dropdown("speed", list(SPEEDS), initial_value=pace)
             places = gui.add_button_group("look from", [_OVERVIEW, *self._motion.cameras])
             places.on_click(lambda event: self._guarded(lambda: self._look_from(event.client, places.value)))
             seen = any(handle is not None for handle in self._splats)

@@ -70,10 +70,10 @@ def test_robomimic_finds_what_it_reads(done: Path) -> None:
 def test_a_killed_run_goes_on_where_it_was(done: Path, inputs: tuple[Path, Path], monkeypatch) -> None:
     out, made = inputs[0].parent / "again", runner.run
 
-    def killed(controller, plant, seed, clock):
+    def killed(controller, plant, seed, *given):
         if seed == 1:
             raise KeyboardInterrupt
-        return made(controller, plant, seed, clock)
+        return made(controller, plant, seed, *given)
 
     monkeypatch.setattr(runner, "run", killed)
     with pytest.raises(KeyboardInterrupt) as caught:

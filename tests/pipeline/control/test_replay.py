@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from cgwm.datasets.models.model import write_model
 from cgwm.datasets.rollouts.control_file import read_runs
-from cgwm.pipeline.control import control, replays_of
+from cgwm.pipeline.control import Following, control, noted_runs, replays_of, replays_or_following, stage
+from cgwm.pipeline.control.loop import Recording
 from cgwm.pipeline.view.motions import replayed
 from cgwm.pipeline.view.stage import open_view
 from cgwm.schemas import InputDataError, task_toml
@@ -50,6 +53,51 @@ def test_a_replay_is_what_was_recorded_and_what_was_predicted(folder: Path) -> N
     shown = replayed(real)
     assert [len(rows["mode"]) for rows in shown.contacts] == pressed.astype(int).tolist()
     assert shown.contacts_known and not replayed(ahead).contacts_known
+
+
+def test_a_run_that_goes_on_is_followed(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noted at each command, killed at the twelfth one of the second run, looked at, and brought to its end."""
+    monkeypatch.setattr(noted_runs, "EVERY_S", 0.0)
+    monkeypatch.setattr(noted_runs, "SHARE", math.inf)
+    monkeypatch.setattr(noted_runs, "KEPT_S", 0.2)
+    out, made, seen = tmp_path / "run", noted_runs.noting, []
+
+    def noting(*given: Any) -> Any:
+        note = made(*given)
+
+        def noted(recording: Recording) -> None:
+            note(recording)
+            if recording.seed == 1 and len(recording.commands["time_s"]) in (3, 12):
+                following = Following(folder / "model", out) if not seen else seen[0]
+                seen.append(following)
+                seen.append(following.motions())
+                if len(seen) == 4:
+                    raise KeyboardInterrupt
+
+        return noted
+
+    monkeypatch.setattr(stage, "noting", noting)
+    given = (folder / "model", folder / "T.toml", out)
+    with pytest.raises(KeyboardInterrupt):
+        control(*given, clock="ideal", seeds=2)
+    following, first, _, second = seen
+    ahead = "predicted 0.5 s before"
+    assert list(first) == ["seed 1", f"seed 1, {ahead}", "seed 0", f"seed 0, {ahead}"]
+    assert list(second) == ["seed 1", f"seed 1, {ahead}"] and not following.over
+    whole = replays_of(folder / "model", folder / "run")[1]["seed 0"]
+    np.testing.assert_array_equal(first["seed 0"].position_m, whole.position_m)
+    assert len(first["seed 1"].times_s) == 3 and len(second["seed 1"].times_s) == 4  # those of the last 0.2 s
+    assert following.motions() == {}
+    again = replays_or_following(folder / "model", out)
+    assert list(again[1]) == list(first) and again[2] is not None
+    monkeypatch.setattr(stage, "noting", made)
+    control(*given, clock="ideal", seeds=2, resume=True)
+    last = following.motions()
+    assert list(last) == list(first) and following.over and following.motions() == {}
+    np.testing.assert_array_equal(last["seed 1"].position_m[8:12], second["seed 1"].position_m)
+    assert replays_or_following(folder / "model", out)[2] is None
+    with pytest.raises(InputDataError, match="none that goes on"):
+        Following(folder / "model", tmp_path / "nothing")
 
 
 def test_a_run_alone_is_refused(folder: Path) -> None:

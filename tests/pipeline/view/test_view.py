@@ -20,9 +20,10 @@ from cgwm.cli import main
 from cgwm.datasets.capture.cameras import Camera
 from cgwm.datasets.models.model import read_model, write_model
 from cgwm.datasets.rollouts.loader import RolloutReader
+from cgwm.datasets.rollouts.replay import Replay
 from cgwm.pipeline.geometry.viewpoint import look_at
 from cgwm.pipeline.synthesize import synthesize
-from cgwm.pipeline.view import open_view
+from cgwm.pipeline.view import open_replays, open_view
 from cgwm.pipeline.view import viewer as viewing
 from cgwm.pipeline.view.client_page import with_whole_corners
 from cgwm.pipeline.view.door import Door
@@ -180,6 +181,27 @@ def test_a_missing_viser_is_one_clear_message(
     monkeypatch.setitem(sys.modules, "viser", None)
     err = refused(capfd, "view", dataset)
     assert err == "'cgwm view' needs the package viser.\nNext: pip install 'cgwm[view]'.\n"
+
+
+@needs_viser
+def test_motions_that_go_on_are_followed() -> None:
+    def moved(frames: int, first: int = 0) -> Replay:
+        times = 0.1 * np.arange(first, first + frames)
+        place, turn = np.zeros((frames, 1, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (frames, 1, 1))
+        place[:, 0, 0] = times
+        return Replay(times_s=times, position_m=place, quat_wxyz=turn)
+
+    more = [{"seed 0": moved(6, 2)}, {}, {"seed 1": moved(2), "seed 0": moved(9)}]
+    with open_replays("run", small_model(), {"seed 0": moved(4)}, port=0, more=lambda: more.pop(0)) as viewer:
+        viewer._frame.value = 3
+        viewer.follow()
+        assert (viewer._frame.value, viewer._frame.max) == (1, 5)  # the same moment, as two frames are gone
+        assert "**0.300 s**, frame 2 of 6" in viewer._status.content
+        viewer.follow()
+        assert (viewer._frame.value, viewer._frame.max) == (1, 5)
+        viewer.follow()
+        assert (viewer._choice.value, viewer._choice.options) == ("seed 1", ("seed 0", "seed 1"))
+        assert "frame 1 of 2" in viewer._status.content
 
 
 @needs_viser
