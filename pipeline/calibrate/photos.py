@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from ...datasets.capture.capture import Capture
@@ -112,7 +113,9 @@ def gather(capture: Capture, folder: Path, intrinsics: Path | None = None, turnt
 def background_flow(frames: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray[np.uint8] | None]) -> float:
     """Return the largest median displacement of corners between the first frame and any other [px].
 
-    The median is that of the background as long as moving bodies cover less than half of the trackable corners.
+    The median is that of the background as long as moving bodies cover less than half of the trackable corners. A
+    corner has stayed where it was if its surroundings look more alike there than where they are followed to: from
+    coarse to fine pictures a moving body drags the corners around it along, in a small video half of them.
 
     Args:
         frames: RGB frames of one camera, each (height, width, 3).
@@ -125,13 +128,21 @@ def background_flow(frames: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray
         return 0.0
     worst = 0.0
     for frame in frames[1:]:
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(
-            first, cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), corners, np.zeros_like(corners)
-        )
-        shift = np.linalg.norm((moved - corners).reshape(-1, 2), axis=1)[np.ravel(found) == 1]
+        shift = _shifts(first, cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), corners)
         if len(shift):
             worst = max(worst, float(np.median(shift)))
     return worst
+
+
+def _shifts(first: MatLike, other: MatLike, corners: MatLike) -> NDArray[np.float64]:
+    """Return how far the corners of a picture that are found in another one have moved [px]."""
+    lengths, errors = [], []
+    for coarser in (0, 3):  # pictures of half the size each, in which they are followed first
+        moved, found, error = cv2.calcOpticalFlowPyrLK(first, other, corners, np.zeros_like(corners), maxLevel=coarser)
+        lengths.append(np.linalg.norm((moved - corners).reshape(-1, 2), axis=1))
+        errors.append(np.where(np.ravel(found) == 1, np.ravel(error), np.inf))
+    best = np.argmin(errors, axis=0)
+    return np.choose(best, lengths)[np.isfinite(np.min(errors, axis=0))]
 
 
 def _known(capture: Capture, sources: Sequence[Source], file: Path | None) -> dict[str, CameraIntrinsics]:

@@ -411,6 +411,20 @@ def test_a_moving_camera_is_told_from_a_moving_body():
     assert background_flow([still, np.roll(still, 6, axis=1)], [None, None]) == pytest.approx(6.0, abs=0.3)
 
 
+def test_a_large_body_in_a_small_video_does_not_drag_the_background_along():
+    rng = np.random.default_rng(0)
+    ground = 128 + 10 * rng.normal(size=(240, 320))
+    frames = []
+    for row, column in ((60, 60), (90, 110)):
+        frame = ground + 2 * rng.normal(size=ground.shape)
+        frame[row : row + 70, column : column + 70] = 20
+        frames.append(np.repeat(frame.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2))
+    # from coarse to fine pictures alone: 55 px
+    assert background_flow(frames, [None, None]) < 0.2
+    moved = [frames[0], np.roll(frames[1], 6, axis=1)]
+    assert background_flow(moved, [None, None]) == pytest.approx(6.0, abs=0.3)
+
+
 def _benchmark():
     spec = importlib.util.spec_from_file_location("benchmark_calibrate", ROOT / "benchmarks" / "calibrate.py")
     assert spec is not None
