@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import InputDataError, did_you_mean
+from ...schemas import CamerasFile, InputDataError, did_you_mean
 from ...schemas.printable import typed_path
 from ...schemas.regular_files import require_regular_file
 from ..shapes.meshes import mass_properties, read_mesh
@@ -95,12 +95,29 @@ def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[Cap
         bodies=capture.body_names, splits={name: len(names) for name, names in capture.manifest.splits.items()}
     )
     faults = Faults()
-    attempt, listed = faults.attempt, faults.listed
+    attempt = faults.attempt
     attempt(_check_names, capture)
     for body in capture.manifest.bodies:
         attempt(_check_shape, capture, body.name)
     attempt(capture.surface_meshes)
     _check_files(capture, faults)
+    sizes = _check_pictures(capture, facts, faults)
+    attempt(_check_cameras, capture, sizes, facts)
+    normalised, unturned = _check_episodes(capture, facts, faults)
+    attempt(_check_consistency, capture, facts, accept_units)
+    if normalised:
+        where = normalised[0] + (f" and {len(normalised) - 1} more files" if len(normalised) > 1 else "")
+        facts.warnings.append(
+            f"{facts.normalised_quaternions} quaternions were normalised (off by up to 1e-3), in {where}."
+        )
+    if warning := capture.unturned_warning(unturned):
+        facts.warnings.append(warning)
+    return facts, faults.found
+
+
+def _check_pictures(capture: CaptureFolder, facts: CaptureFacts, faults: Faults) -> dict[str, tuple[int, int]]:
+    """Check photos, and their masks and maps; return width and height of the photos by name."""
+    attempt, listed = faults.attempt, faults.listed
     sizes: dict[str, tuple[int, int]] = {}
     photos = listed(capture.photos)
     for name in photos:
@@ -116,26 +133,25 @@ def find_faults(capture: CaptureFolder, accept_units: bool = False) -> tuple[Cap
             attempt(_check_map, capture, kind, name, by_stem, sizes, facts)
     if coverage:
         facts.mask_coverage = dict(zip(facts.bodies, np.mean(coverage, axis=0)[1:].tolist(), strict=True))
-    attempt(_check_cameras, capture, sizes, facts)
-    episodes, unturned = listed(capture.episodes), {}
+    return sizes
+
+
+def _check_episodes(
+    capture: CaptureFolder, facts: CaptureFacts, faults: Faults
+) -> tuple[list[str], dict[str, tuple[str, ...]]]:
+    """Check tracks and videos; return the track files with normalised quaternions, and bodies that never turn."""
+    episodes = faults.listed(capture.episodes)
     facts.episodes = len(episodes)
     normalised: list[str] = []
+    unturned: dict[str, tuple[str, ...]] = {}
     for episode in episodes:
         before = facts.normalised_quaternions
-        attempt(_check_tracks, capture, episode, facts, unturned)
+        faults.attempt(_check_tracks, capture, episode, facts, unturned)
         if facts.normalised_quaternions > before:
             normalised.append(f"tracks/{episode}.csv")
-        for camera in listed(capture.videos, episode):
-            attempt(_check_video, capture, camera, episode, facts)
-    attempt(_check_consistency, capture, facts, accept_units)
-    if facts.normalised_quaternions:
-        where = normalised[0] + (f" and {len(normalised) - 1} more files" if len(normalised) > 1 else "")
-        facts.warnings.append(
-            f"{facts.normalised_quaternions} quaternions were normalised (off by up to 1e-3), in {where}."
-        )
-    if warning := capture.unturned_warning(unturned):
-        facts.warnings.append(warning)
-    return facts, faults.found
+        for camera in faults.listed(capture.videos, episode):
+            faults.attempt(_check_video, capture, camera, episode, facts)
+    return normalised, unturned
 
 
 def _check_consistency(capture: CaptureFolder, facts: CaptureFacts, accept_units: bool) -> None:
@@ -161,30 +177,27 @@ def _check_names(capture: CaptureFolder) -> None:
     found = capture.episodes()
     splits = manifest.splits if capture.only_splits is None else {s: capture.episodes(s) for s in capture.only_splits}
     todo = f"correct the name, or add tracks/<episode>.csv or videos/<camera>/<episode> to {capture.root}."
-    for split, names in splits.items():
-        for name in names:
-            if name not in found:
-                raise InputDataError(
-                    f"{path}: [splits] {split} names the episode '{name}', which has neither track nor video.",
-                    _listed(found, "episodes") + did_you_mean(name, found),
-                    todo,
-                )
+    named = [
+        (f"[splits] {split} names the episode '{name}'", name) for split, names in splits.items() for name in names
+    ]
     if capture.only_splits is None:
-        for name in manifest.episodes:
-            if name not in found:
-                raise InputDataError(
-                    f"{path}: [episodes] names '{name}', which has neither track nor video.",
-                    _listed(found, "episodes") + did_you_mean(name, found),
-                    todo,
-                )
-    cameras = capture.video_cameras()
+        named += [(f"[episodes] names '{name}'", name) for name in manifest.episodes]
+    for words, name in named:
+        _require_among(found, "episodes", name, f"{path}: {words}, which has neither track nor video.", todo)
     for name in manifest.video.camera_time_offset_s:
-        if name not in cameras:
-            raise InputDataError(
-                f"{path}: [video] camera_time_offset_s names the camera '{name}', which has no directory in videos/.",
-                _listed(cameras, "cameras") + did_you_mean(name, cameras),
-                "correct the name, or remove the entry.",
-            )
+        _require_among(
+            capture.video_cameras(),
+            "cameras",
+            name,
+            f"{path}: [video] camera_time_offset_s names the camera '{name}', which has no directory in videos/.",
+            "correct the name, or remove the entry.",
+        )
+
+
+def _require_among(found: list[str], noun: str, name: str, fault: str, todo: str) -> None:
+    """Refuse a name that is not among those on disk."""
+    if name not in found:
+        raise InputDataError(fault, _listed(found, noun) + did_you_mean(name, found), todo)
 
 
 def _listed(names: list[str], noun: str) -> str:
@@ -294,16 +307,20 @@ def _check_labels(
         )
     bodies = len(capture.manifest.bodies)
     if labels.max() > bodies:
-        hint = ""
-        if set(np.unique(labels)) <= {0, 255} and bodies:
-            hint = "for a mask of 0 and 255, divide it by 255 (and multiply by the body's number)."
-        elif not bodies:
-            hint = 'name the body in capture.toml: a line [[bodies]], and under it name = "object".'
         raise InputDataError(
             f"{path}: label {labels.max()}, but the manifest has {bodies} [[bodies]].",
             f"0 (background) to {bodies}: label k is the k-th of [[bodies]].",
-            hint or "correct the mask, or add the bodies to capture.toml.",
+            _hint(labels, bodies),
         )
+
+
+def _hint(labels: NDArray[np.uint8], bodies: int) -> str:
+    """Return what to do about labels of more bodies than there are."""
+    if not bodies:
+        return 'name the body in capture.toml: a line [[bodies]], and under it name = "object".'
+    if set(np.unique(labels)) <= {0, 255}:
+        return "for a mask of 0 and 255, divide it by 255 (and multiply by the body's number)."
+    return "correct the mask, or add the bodies to capture.toml."
 
 
 def _check_cameras(capture: CaptureFolder, sizes: dict[str, tuple[int, int]], facts: CaptureFacts) -> None:
@@ -311,6 +328,21 @@ def _check_cameras(capture: CaptureFolder, sizes: dict[str, tuple[int, int]], fa
     if cameras is None:
         return
     facts.scale = cameras.scale.kind
+    _require_photos(capture, cameras)
+    _require_calibrated_sizes(capture, cameras, sizes)
+    facts.photos_with_camera = sum(name in cameras.images for name in sizes)
+    names = capture.video_cameras()
+    for name in cameras.videos:
+        if name.partition("/")[0] not in names:
+            raise InputDataError(
+                f"{capture.root / 'cameras.json'}: a camera for the videos '{name}', which are not in videos/.",
+                _listed(names, "cameras") + did_you_mean(name, names),
+                "add the videos, or remove the camera from cameras.json.",
+            )
+
+
+def _require_photos(capture: CaptureFolder, cameras: CamerasFile) -> None:
+    """Refuse cameras of photos that are not there."""
     photos = set(capture.photos())
     absent = [name for name in cameras.images if name not in photos]
     if absent:
@@ -321,6 +353,10 @@ def _check_cameras(capture: CaptureFolder, sizes: dict[str, tuple[int, int]], fa
             "names relative to images/." + did_you_mean(absent[0], sorted(photos)),
             "add the photos, or remove the cameras.",
         )
+
+
+def _require_calibrated_sizes(capture: CaptureFolder, cameras: CamerasFile, sizes: dict[str, tuple[int, int]]) -> None:
+    """Refuse photos of another size than that of their cameras."""
     for name, image in cameras.images.items():
         camera = cameras.cameras[image.camera]
         if name in sizes and sizes[name] != (camera.width, camera.height):
@@ -329,15 +365,6 @@ def _check_cameras(capture: CaptureFolder, sizes: dict[str, tuple[int, int]], fa
                 f"'{image.camera}' has {camera.width}x{camera.height} px.",
                 "the image size that the camera was calibrated for.",
                 "calibrate these photos at the size that they have.",
-            )
-    facts.photos_with_camera = sum(name in cameras.images for name in sizes)
-    names = capture.video_cameras()
-    for name in cameras.videos:
-        if name.partition("/")[0] not in names:
-            raise InputDataError(
-                f"{capture.root / 'cameras.json'}: a camera for the videos '{name}', which are not in videos/.",
-                _listed(names, "cameras") + did_you_mean(name, names),
-                "add the videos, or remove the camera from cameras.json.",
             )
 
 
@@ -369,17 +396,22 @@ def _check_video(capture: CaptureFolder, camera: str, episode: str, facts: Captu
             f"{path}: the file says {info.frame_rate_hz:g} frames/s; capture.toml's {rate:g} is used."
         )
     _check_video_camera(capture, camera, episode, path, info)
+    _check_video_masks(capture, camera, episode, info)
+
+
+def _check_video_masks(capture: CaptureFolder, camera: str, episode: str, info: VideoInfo) -> None:
     masks = capture.root / "video_masks" / camera / episode
-    if has_folder(masks):
-        files = frame_files(masks)
-        if len(files) != info.frames:
-            raise InputDataError(
-                f"{masks}: {len(files)} masks for {info.frames} frames.",
-                "one mask a frame, or no directory.",
-                "make one mask for each frame, or remove the folder.",
-            )
-        for file in files:
-            _check_labels(capture, file, read_label(file), (info.width, info.height), f"videos/{camera}/{episode}")
+    if not has_folder(masks):
+        return
+    files = frame_files(masks)
+    if len(files) != info.frames:
+        raise InputDataError(
+            f"{masks}: {len(files)} masks for {info.frames} frames.",
+            "one mask a frame, or no directory.",
+            "make one mask for each frame, or remove the folder.",
+        )
+    for file in files:
+        _check_labels(capture, file, read_label(file), (info.width, info.height), f"videos/{camera}/{episode}")
 
 
 def _check_video_camera(capture: CaptureFolder, camera: str, episode: str, path: Path, info: VideoInfo) -> None:

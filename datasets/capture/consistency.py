@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import CaptureManifest, Ground, InputDataError
+from ...schemas import Body, CaptureManifest, Ground, InputDataError, Shape
 from .folder import CaptureFolder
 from .surface_distance import surface_distance
 from .tracked_motion import TrackedMotion, outline_of, tracked_motions
@@ -97,18 +97,27 @@ class Agreement:
         """Return whether motion is seen that the correction explains, and much better than as it is written."""
         if correction.changes_gravity and written.like_gravity >= CONFIRMED:
             return False
-        falling = (1 - self.adrift) * self.flights
-        # What is adrift as written may hang, be held, or stand on what is not in the capture: so no other frame of a
-        # motion that never falls is better, and of other units only one in which it lies on the ground exactly.
-        impossible = written.buried >= WRONG or correction.length <= 0.01
-        lies = self.lying >= FEWEST and self.lying >= 0.8 * self.touching and self.windows >= KEPT * written.windows
-        seen = falling >= FEWEST or (lies and impossible and not correction.changes_fall)
         good = self.buried <= LEFT_BURIED and self.adrift <= LEFT_ADRIFT
         if good and MUCH_BETTER * (self.wrong + self.adrift) <= written.wrong + written.adrift:
-            return seen
+            return self.falling >= FEWEST or self._lies_instead(written, correction)
         # what bounces on a ground that is not in the capture falls between the bounces, which nothing else imitates
-        falls = min(falling, self.like_gravity * self.windows) >= FALLS * max(written.windows, FALLS_FEWEST)
+        falls = min(self.falling, self.like_gravity * self.windows) >= FALLS * max(written.windows, FALLS_FEWEST)
         return falls and self.buried <= LEFT_BURIED and written.like_gravity <= FALLS_NEVER
+
+    @property
+    def falling(self) -> float:
+        """Number of the windows in which a body falls."""
+        return (1 - self.adrift) * self.flights
+
+    def _lies_instead(self, written: Agreement, correction: Correction) -> bool:
+        """Return whether bodies that never fall lie on the ground after a correction, and cannot be as written.
+
+        What is adrift as written may hang, be held, or stand on what is not in the capture: so no other frame of a
+        motion that never falls is better, and of other units only one in which it lies on the ground exactly.
+        """
+        impossible = written.buried >= WRONG or correction.length <= 0.01
+        lies = self.lying >= FEWEST and self.lying >= 0.8 * self.touching and self.windows >= KEPT * written.windows
+        return lies and impossible and not correction.changes_fall
 
 
 def check_consistency(capture: CaptureFolder) -> list[str]:
@@ -186,16 +195,22 @@ def _contact(
         touches = ~deep if motion.outline is None else low <= TOUCH_SHARE * size + slack
         touches &= _presses(manifest, correction)
         lies = np.abs(low) <= LYING_SHARE * size + 4 * correction.length * motion.windows.noise
+    return deep, touches | _touches_others(manifest, motion, correction), lies
+
+
+def _touches_others(manifest: CaptureManifest, motion: TrackedMotion, correction: Correction) -> NDArray[np.bool_]:
+    """Return in which windows a body may touch other bodies or fixed surfaces."""
     own = np.inf if motion.outline is None else motion.outline.size_m
+    touches = np.zeros(len(motion.windows.first), bool)
     for place, size in motion.others:
         between = correction.length * np.linalg.norm(motion.track.position_m - place, axis=1)
         nearest, _ = motion.windows.extremes(between)
-        touches = touches | (nearest <= 1.3 * correction.shape * (own + size))
+        touches |= nearest <= 1.3 * correction.shape * (own + size)
     if manifest.surfaces:
         apart = surface_distance(manifest.surfaces, correction.length * motion.track.position_m)
         nearest, _ = motion.windows.extremes(apart)
-        touches = touches | (nearest <= 1.3 * correction.shape * own)
-    return deep, touches, lies
+        touches |= nearest <= 1.3 * correction.shape * own
+    return touches
 
 
 def _presses(manifest: CaptureManifest, correction: Correction) -> bool:
@@ -259,24 +274,25 @@ def _better_order(manifest: CaptureManifest, motions: Sequence[TrackedMotion]) -
     if manifest.world.ground is None or not seen:
         return None
 
-    def depths(correction: Correction) -> Array:
-        """Return depths under the ground of all frames, as shares of the size."""
-        shares = []
-        for motion in seen:
-            gap = clearance(manifest, motion, correction)
-            assert gap is not None and motion.outline is not None  # of `seen`, with a ground
-            shares.append(-gap / motion.outline.size_m)
-        return np.concatenate(shares)
-
-    written = depths(AS_WRITTEN)
-    if (written > LYING_SHARE).mean() < LYING_FRAMES:
+    written = float((_depths(manifest, seen, AS_WRITTEN) > LYING_SHARE).mean())
+    if written < LYING_FRAMES:
         return None
     for correction in ORDERS:
-        corrected = depths(correction)
+        corrected = _depths(manifest, seen, correction)
         lies = (np.abs(corrected) < LYING_TIGHT).mean() >= LYING_FRAMES
-        if lies and (corrected > LYING_SHARE).mean() <= (written > LYING_SHARE).mean() / 10:
+        if lies and (corrected > LYING_SHARE).mean() <= written / 10:
             return correction
     return None
+
+
+def _depths(manifest: CaptureManifest, motions: Sequence[TrackedMotion], correction: Correction) -> Array:
+    """Return depths under the ground, which there is, of all frames of motions with outlines, as shares of the size."""
+    shares = []
+    for motion in motions:
+        gap = clearance(manifest, motion, correction)
+        assert gap is not None and motion.outline is not None
+        shares.append(-gap / motion.outline.size_m)
+    return np.concatenate(shares)
 
 
 def check_gravity(gravity_m_s2: Sequence[float], ground: Ground | None, where: str) -> None:
@@ -312,21 +328,9 @@ def _check_densities(capture: CaptureFolder, where: str) -> None:
     And a centre of mass outside of the shape, beyond what a rounded shape leaves.
     """
     for body in capture.manifest.bodies:
-        outline = None if body.com_m is None else outline_of(capture, body)
-        if outline is not None and float(np.linalg.norm(body.com_m or ())) > FARTHEST_COM * outline.size_m:
-            raise InputDataError(
-                f"{where}: [[bodies]] '{body.name}': com_m lies {np.linalg.norm(body.com_m or ()):.3g} m from the "
-                f"origin of the body frame; its shape reaches {outline.size_m:.3g} m.",
-                "a centre of mass within the shape, in metres.",
-                "correct com_m or shape.",
-            )
-        if body.shape is None or body.mass_kg is None:
-            continue
-        if body.shape.box is not None:
-            volume = 8 * float(np.prod(body.shape.box.half_extents_m))
-        elif body.shape.sphere is not None:
-            volume = 4 / 3 * np.pi * body.shape.sphere.radius_m**3
-        else:
+        _check_center(capture, body, where)
+        volume = None if body.shape is None else _volume_m3(body.shape)
+        if volume is None or body.mass_kg is None:
             continue
         density = body.mass_kg / volume
         low, high = SOLID_KG_M3
@@ -335,6 +339,24 @@ def _check_densities(capture: CaptureFolder, where: str) -> None:
                 f"{where}: [[bodies]] '{body.name}': {body.mass_kg:g} kg in {volume:.3g} m3 are {density:.2g} kg/m3.",
                 *_allowed("correct shape or mass_kg.", f"{low:g} to {high:g} kg/m3: shapes in metres, masses in kg."),
             )
+
+
+def _check_center(capture: CaptureFolder, body: Body, where: str) -> None:
+    outline = None if body.com_m is None else outline_of(capture, body)
+    if outline is not None and float(np.linalg.norm(body.com_m or ())) > FARTHEST_COM * outline.size_m:
+        raise InputDataError(
+            f"{where}: [[bodies]] '{body.name}': com_m lies {np.linalg.norm(body.com_m or ()):.3g} m from the "
+            f"origin of the body frame; its shape reaches {outline.size_m:.3g} m.",
+            "a centre of mass within the shape, in metres.",
+            "correct com_m or shape.",
+        )
+
+
+def _volume_m3(shape: Shape) -> float | None:
+    """Return the volume of a box or a ball; None of other shapes."""
+    if shape.box is not None:
+        return 8 * float(np.prod(shape.box.half_extents_m))
+    return None if shape.sphere is None else 4 / 3 * np.pi * shape.sphere.radius_m**3
 
 
 def _contradiction(written: Agreement) -> str:
@@ -377,17 +399,22 @@ def _warnings(manifest: CaptureManifest, motions: Sequence[TrackedMotion], where
             under.append(float((gap < -limit).mean()))
     measured = np.concatenate(flights)
     if strength and len(measured) >= FEWEST:
-        middle = np.median(measured, axis=0)
-        if np.linalg.norm(middle - gravity) > OFF * strength:
-            yield (
-                f"{where}: where nothing touches the bodies, their acceleration is {_shown(middle)} m/s2 (median of "
-                f"{len(measured)} windows); gravity is {_shown(gravity)} m/s2. Candidates: forces in the air (drag, "
-                "lift, buoyancy, wind), a carried body, a tilted frame, another frame rate, another scale of length."
-            )
+        yield from _other_fall(measured, gravity, where)
     if under and np.mean(under) > OFF:
         yield (
             f"{where}: in {100 * np.mean(under):.0f} % of the frames a body is under the ground by more than "
             f"{MEASURED_SHARE:.0%} of its size. Candidates: the ground's height or tilt, the shape, the tracked point."
+        )
+
+
+def _other_fall(measured: Array, gravity: Array, where: str) -> Iterator[str]:
+    """Yield a warning where the accelerations (n, 3) of free bodies are not that of gravity [m/s2]."""
+    middle = np.median(measured, axis=0)
+    if np.linalg.norm(middle - gravity) > OFF * float(np.linalg.norm(gravity)):
+        yield (
+            f"{where}: where nothing touches the bodies, their acceleration is {_shown(middle)} m/s2 (median of "
+            f"{len(measured)} windows); gravity is {_shown(gravity)} m/s2. Candidates: forces in the air (drag, "
+            "lift, buoyancy, wind), a carried body, a tilted frame, another frame rate, another scale of length."
         )
 
 

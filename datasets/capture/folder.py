@@ -117,13 +117,7 @@ class CaptureFolder:
                 "a path relative to the capture directory.",
                 "add the file, or correct its name in capture.toml.",
             )
-        legal = (".obj", ".stl") if body.shape and body.shape.mesh else (".ply",)
-        if path.suffix.lower() not in legal:
-            raise InputDataError(
-                f"{where}: the suffix is '{path.suffix}'.",
-                " or ".join(legal) + ".",
-                "convert the file to one of these formats.",
-            )
+        _require_suffix(path, where, (".obj", ".stl") if body.shape and body.shape.mesh else (".ply",))
         return path
 
     # Photos
@@ -164,14 +158,7 @@ class CaptureFolder:
                 directory.
         """
         if split is not None:
-            if split not in self.manifest.splits:
-                legal = sorted(self.manifest.splits)
-                allowed = ", ".join(legal) + "." + did_you_mean(split, legal) if legal else "none: [splits] is empty."
-                todo = "name it in [splits]." if legal else (
-                    "list its episodes in [splits], which are the names of tracks/<episode>.csv or of "
-                    "videos/<camera>/<episode>.mp4."
-                )  # fmt: skip
-                raise UsageError(f"{self.root / 'capture.toml'}: no split '{split}'.", allowed, todo)
+            _require_split(self.root / "capture.toml", self.manifest, split)
             return list(self.manifest.splits[split])
         found = {path.stem for path in entries_of(self.root / "tracks") if path.suffix == ".csv"}
         for camera in _cameras(self.root / "videos"):
@@ -209,14 +196,7 @@ class CaptureFolder:
         start_s, end_s = self._window(episode)
         windowed = {name: track.window(start_s, end_s) for name, track in tracks.items()}
         for name, track in windowed.items():
-            if len(track) < 2:
-                raise InputDataError(
-                    f"{path}: body '{name}' has {len(track)} of {len(tracks[name])} samples between the "
-                    f"episode's start_s and end_s.",
-                    "at least 2.",
-                    f"correct [episodes] '{episode}' in capture.toml; the track lasts from "
-                    f"{tracks[name].time_s[0]:g} s to {tracks[name].time_s[-1]:g} s.",
-                )
+            _require_samples(path, name, episode, track, tracks[name])
             require_told_spin(path, name, track)
         return CheckedTracks(windowed, normalised, tuple(unturned))
 
@@ -398,4 +378,38 @@ def _require_exerted(path: Path, body: Body, track: Track) -> None:
             f"{path}: body '{body.name}' has a torque but no force.",
             "force_x_n, force_y_n and force_z_n with it.",
             "add the columns force_x_n, force_y_n and force_z_n, or remove the torque.",
+        )
+
+
+def _require_suffix(path: Path, where: str, legal: tuple[str, ...]) -> None:
+    if path.suffix.lower() not in legal:
+        raise InputDataError(
+            f"{where}: the suffix is '{path.suffix}'.",
+            " or ".join(legal) + ".",
+            "convert the file to one of these formats.",
+        )
+
+
+def _require_split(path: Path, manifest: CaptureManifest, split: str) -> None:
+    """Refuse a split that the manifest at `path` does not name."""
+    if split in manifest.splits:
+        return
+    legal = sorted(manifest.splits)
+    allowed = ", ".join(legal) + "." + did_you_mean(split, legal) if legal else "none: [splits] is empty."
+    todo = "name it in [splits]." if legal else (
+        "list its episodes in [splits], which are the names of tracks/<episode>.csv or of "
+        "videos/<camera>/<episode>.mp4."
+    )  # fmt: skip
+    raise UsageError(f"{path}: no split '{split}'.", allowed, todo)
+
+
+def _require_samples(path: Path, body: str, episode: str, windowed: Track, whole: Track) -> None:
+    """Refuse a window of an episode in which a track has a single sample or none."""
+    if len(windowed) < 2:
+        raise InputDataError(
+            f"{path}: body '{body}' has {len(windowed)} of {len(whole)} samples between the "
+            f"episode's start_s and end_s.",
+            "at least 2.",
+            f"correct [episodes] '{episode}' in capture.toml; the track lasts from "
+            f"{whole.time_s[0]:g} s to {whole.time_s[-1]:g} s.",
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -104,6 +104,20 @@ def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Trac
     rows = csv_rows(path)
     header = [cell.strip() for cell in next(rows, (0, []))[1]]
     _check_header(path, header)
+    by_body = _by_body(path, header, rows, legal)
+    if not by_body:
+        raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
+    tracks, normalised = {}, 0
+    for name, numbered in by_body.items():
+        tracks[name], count = _track(path, name, header, numbered)
+        normalised += count
+    return tracks, normalised
+
+
+def _by_body(
+    path: Path, header: list[str], rows: Iterable[tuple[int, list[str]]], legal: list[str]
+) -> dict[str, list[tuple[int, list[str]]]]:
+    """Return the lines of each body with their numbers; each has as many cells as the header."""
     by_body: dict[str, list[tuple[int, list[str]]]] = {}
     for line, row in rows:
         if not any(cell.strip() for cell in row):
@@ -119,13 +133,7 @@ def read_tracks(path: Path | str, bodies: Iterable[str]) -> tuple[dict[str, Trac
                 f"{path}, line {line}: unknown body {shown(name)}.", allowed, "correct it, or add it to capture.toml."
             )
         by_body.setdefault(name, []).append((line, row))
-    if not by_body:
-        raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
-    tracks, normalised = {}, 0
-    for name, numbered in by_body.items():
-        tracks[name], count = _track(path, name, header, numbered)
-        normalised += count
-    return tracks, normalised
+    return by_body
 
 
 def write_tracks(path: Path | str, tracks: dict[str, Track], overwrite: bool = False) -> None:
@@ -147,14 +155,19 @@ def tracks_csv(tracks: dict[str, Track]) -> str:
     rows: list[tuple[float, int, list[str]]] = []
     for order, (body, track) in enumerate(tracks.items()):
         for k in range(len(track)):
-            row = [_text(track.time_s[k]), body, *map(_text, track.position_m[k])]
-            for name, columns in groups.items():
-                values = getattr(track, name)
-                row += [""] * len(columns) if values is None else map(_text, values[k])
-            rows.append((float(track.time_s[k]), order, row))
+            rows.append((float(track.time_s[k]), order, _row(body, track, k, groups)))
     rows.sort(key=lambda entry: entry[:2])
     header = [*_REQUIRED, *(column for columns in groups.values() for column in columns)]
     return "".join(",".join(row) + "\n" for row in [header, *(row for _, _, row in rows)])
+
+
+def _row(body: str, track: Track, k: int, groups: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the cells of a sample, empty ones for columns of other tracks."""
+    row = [_text(track.time_s[k]), body, *map(_text, track.position_m[k])]
+    for name, columns in groups.items():
+        values = getattr(track, name)
+        row += [""] * len(columns) if values is None else map(_text, values[k])
+    return row
 
 
 def _text(value: float) -> str:
@@ -210,28 +223,35 @@ def _columns(
     values = np.empty((len(rows), len(names)))
     for k, (line, row) in enumerate(rows):
         for j, index in enumerate(indices):
-            try:
-                values[k, j] = number_of(row[index])
-            except ValueError:
-                fault = f"{shown(row[index])} is no number" if row[index].strip() else "the value is missing"
-                raise InputDataError(
-                    f"{path}, line {line}: body '{body}', column '{names[j]}': {fault}.",
-                    "finite numbers.",
-                    "correct the value, or leave out the whole line where nothing was measured.",
-                ) from None
-            if not math.isfinite(values[k, j]):
-                raise InputDataError(
-                    f"{path}, line {line}: body '{body}', column '{names[j]}' is {row[index].strip()[:MOST_SHOWN]}.",
-                    "finite numbers; gaps are allowed.",
-                    "leave out the whole line where nothing was measured.",
-                )
-            if abs(values[k, j]) > LARGEST:
-                raise InputDataError(
-                    f"{path}, line {line}: body '{body}', column '{names[j]}' is {values[k, j]:g}.",
-                    f"numbers up to {LARGEST:g}, in SI units.",
-                    "correct the value.",
-                )
+            values[k, j] = value = _float_of(row[index])
+            if not abs(value) <= LARGEST:
+                raise _wrong_number(f"{path}, line {line}: body '{body}', column '{names[j]}'", row[index])
     return values
+
+
+def _float_of(text: str) -> float:
+    """Return the number that a cell holds; NaN of one that holds none."""
+    try:
+        return number_of(text)
+    except ValueError:
+        return math.nan
+
+
+def _wrong_number(where: str, text: str) -> InputDataError:
+    """Return the error of a cell that holds no number, or one that is not finite or too large."""
+    try:
+        value = number_of(text)
+    except ValueError:
+        fault = f"{shown(text)} is no number" if text.strip() else "the value is missing"
+        todo = "correct the value, or leave out the whole line where nothing was measured."
+        return InputDataError(f"{where}: {fault}.", "finite numbers.", todo)
+    if not math.isfinite(value):
+        return InputDataError(
+            f"{where} is {text.strip()[:MOST_SHOWN]}.",
+            "finite numbers; gaps are allowed.",
+            "leave out the whole line where nothing was measured.",
+        )
+    return InputDataError(f"{where} is {value:g}.", f"numbers up to {LARGEST:g}, in SI units.", "correct the value.")
 
 
 def _optional(

@@ -64,10 +64,8 @@ def cameras_of(data: Any, path: Path, metric: bool = False) -> CamerasFile:
             raise InputDataError(f"{where}: no 'file_path'.", "the path of its photo, a text.", _EXPORT)
         file = _image_file(path.parent, frame["file_path"])
         intrinsics = _intrinsics(where, {**data, **frame}, path.parent / file)
-        camera = next((name for name, known in cameras.items() if known == intrinsics), None)
-        if camera is None:
-            camera = f"camera{len(cameras)}"
-            cameras[camera] = intrinsics
+        camera = next((name for name, known in cameras.items() if known == intrinsics), f"camera{len(cameras)}")
+        cameras[camera] = intrinsics
         name = file.removeprefix("images/")
         if name in images:
             raise InputDataError(
@@ -113,20 +111,8 @@ def _pose(where: str, frame: dict[str, Any]) -> Matrix4:
 
 
 def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrinsics:
-    model = str(fields.get("camera_model", "OPENCV"))
-    if model not in _MODELS or fields.get("is_fisheye"):
-        raise InputDataError(
-            f"{where}: the camera model is {model if model not in _MODELS else 'a fisheye'}.",
-            ", ".join(_MODELS) + ".",
-            "undistort the photos to a pinhole camera first.",
-        )
     values = {name: _number(where, fields, name) for name in _INTRINSICS if name in fields}
-    if values.get("k4"):
-        raise InputDataError(
-            f"{where}: k4 = {values['k4']:g}.",
-            "distortion by k1, k2, p1, p2, k3.",
-            "undistort the pictures, or fit their camera without k4.",
-        )
+    _require_pinhole(where, fields, values.get("k4", 0.0))
     if "w" in values and "h" in values:
         width, height = round(values["w"]), round(values["h"])
     else:
@@ -143,6 +129,23 @@ def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrin
         cy=values.get("cy", height / 2),
         distortion=distortion if distortion[4] else distortion[:4],
     )
+
+
+def _require_pinhole(where: str, fields: dict[str, Any], k4: float) -> None:
+    """Refuse a camera that is no pinhole, or whose distortion has a term too many."""
+    model = str(fields.get("camera_model", "OPENCV"))
+    if model not in _MODELS or fields.get("is_fisheye"):
+        raise InputDataError(
+            f"{where}: the camera model is {model if model not in _MODELS else 'a fisheye'}.",
+            ", ".join(_MODELS) + ".",
+            "undistort the photos to a pinhole camera first.",
+        )
+    if k4:
+        raise InputDataError(
+            f"{where}: k4 = {k4:g}.",
+            "distortion by k1, k2, p1, p2, k3.",
+            "undistort the pictures, or fit their camera without k4.",
+        )
 
 
 def _focal_lengths(where: str, values: dict[str, float], width: int, height: int) -> tuple[float, float]:

@@ -64,6 +64,11 @@ class Correction:
 
 def unit_corrections() -> Iterator[Correction]:
     """Yield the corrections of units: of positions, shapes, times and frame rates."""
+    yield from _length_corrections()
+    yield from _time_corrections()
+
+
+def _length_corrections() -> Iterator[Correction]:
     for name, factor in LENGTHS.items():
         yield Correction(
             mistake=f"the tracks' positions are in {name}",
@@ -83,6 +88,9 @@ def unit_corrections() -> Iterator[Correction]:
             mistake=f"the shapes are in {name}", remedy=f"multiply [[bodies]] shape by {LENGTHS[name]:g}.",
             shape=LENGTHS[name],
         )  # fmt: skip
+
+
+def _time_corrections() -> Iterator[Correction]:
     for name, factor in TIMES.items():
         yield Correction(mistake=f"the times are in {name}", remedy=f"multiply time_s by {factor:g}.", time=factor)
     for rate in FRAME_RATES:
@@ -115,6 +123,20 @@ def frame_corrections(gravity: Array, normal: Array | None) -> Iterator[Correcti
     strength = float(np.linalg.norm(gravity))
     if strength == 0:
         return
+    yield from _axis_corrections(strength, normal)
+    yield Correction(
+        mistake="gravity has the opposite sign", remedy="correct [world] gravity_m_s2.", gravity=_three(-gravity)
+    )
+    for name in ("millimetres", "centimetres", "inches"):
+        yield Correction(
+            mistake=f"gravity is in {name} per second squared",
+            remedy=f"multiply [world] gravity_m_s2 by {LENGTHS[name]:g}.",
+            gravity=_three(LENGTHS[name] * gravity),
+        )
+
+
+def _axis_corrections(strength: float, normal: Array | None) -> Iterator[Correction]:
+    """Yield the corrections of the axis that is up, for a strength of gravity [m/s2]."""
     for (name, axis), sign in itertools.product(AXES.items(), (1.0, -1.0)):
         up = sign * np.array(axis)
         word = f"{'+' if sign > 0 else '-'}{name}"
@@ -134,15 +156,6 @@ def frame_corrections(gravity: Array, normal: Array | None) -> Iterator[Correcti
         )
         yield Correction(
             mistake=f"the ground's normal is {word}", remedy="correct [world] ground normal.", normal=_three(up)
-        )
-    yield Correction(
-        mistake="gravity has the opposite sign", remedy="correct [world] gravity_m_s2.", gravity=_three(-gravity)
-    )
-    for name in ("millimetres", "centimetres", "inches"):
-        yield Correction(
-            mistake=f"gravity is in {name} per second squared",
-            remedy=f"multiply [world] gravity_m_s2 by {LENGTHS[name]:g}.",
-            gravity=_three(LENGTHS[name] * gravity),
         )
 
 

@@ -26,21 +26,7 @@ def unpacked(source: Path, endings: Sequence[str]) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as place:
         try:
             with tarfile.open(require_regular_file(source)) as archive:
-                for number, entry in enumerate(archive):
-                    name = PurePosixPath(entry.name)
-                    if not entry.isfile() or name.suffix.lower() not in endings:
-                        continue
-                    if entry.size > _MOST_BYTES or number > _MOST_ENTRIES:
-                        raise InputDataError(
-                            f"{source}: '{name}' is too large.",
-                            f"up to {_MOST_BYTES} bytes.",
-                            "take the original archive.",
-                        )
-                    content = archive.extractfile(entry)
-                    # names alone, so that nothing is written elsewhere
-                    folder = Path(place) / name.parent.name.replace("..", "_")
-                    folder.mkdir(exist_ok=True)
-                    (folder / name.name).write_bytes(b"" if content is None else content.read())
+                _unpack(source, archive, endings, Path(place))
         except (tarfile.TarError, EOFError, OSError) as error:
             if isinstance(error, InputDataError):
                 raise
@@ -48,3 +34,19 @@ def unpacked(source: Path, endings: Sequence[str]) -> Iterator[Path]:
                 f"{source}: it is no archive that can be read.", "a folder, or a .tar.xz.", "download it again."
             ) from None
         yield Path(place)
+
+
+def _unpack(source: Path, archive: tarfile.TarFile, endings: Sequence[str], place: Path) -> None:
+    """Write the files of an archive whose names end so, by their names and those of their folders alone."""
+    for number, entry in enumerate(archive):
+        name = PurePosixPath(entry.name)
+        if not entry.isfile() or name.suffix.lower() not in endings:
+            continue
+        if entry.size > _MOST_BYTES or number > _MOST_ENTRIES:
+            raise InputDataError(
+                f"{source}: '{name}' is too large.", f"up to {_MOST_BYTES} bytes.", "take the original archive."
+            )
+        content = archive.extractfile(entry)
+        folder = place / name.parent.name.replace("..", "_")
+        folder.mkdir(exist_ok=True)
+        (folder / name.name).write_bytes(b"" if content is None else content.read())

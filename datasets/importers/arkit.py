@@ -79,20 +79,24 @@ def import_arkit(source: Path | str, out: Path | str, photos: int = 60, overwrit
                 f"{source}: neither odometry.csv (Stray Scanner) nor lowres_wide.traj (ARKitScenes).",
                 todo="name the folder that holds it.",
             )
-        cameras, images = {}, {}
-        for one in taken:
-            fault = pose_fault(one.T_world_cam)
-            if fault is not None:
-                raise InputDataError(
-                    f"{one.where}: {fault}.",
-                    "a rotation and a position in metres.",
-                    "take the file of the original recording.",
-                )
-            key = next((key for key, known in cameras.items() if known == one.camera), f"camera{len(cameras)}")
-            cameras[key] = one.camera
-            images[one.name] = PosedImage(camera=key, T_world_cam=matrix4(one.T_world_cam))
-        posed = CamerasFile(scale=Scale(kind="metric", source="ARKit"), cameras=cameras, images=images)
-        return write_photo_capture(directory, out, len(images), posed, notes)
+        return write_photo_capture(directory, out, len(taken), _posed(taken), notes)
+
+
+def _posed(taken: Sequence[_Taken]) -> CamerasFile:
+    """Return the cameras of photos; those with the same numbers are one."""
+    cameras, images = {}, {}
+    for one in taken:
+        fault = pose_fault(one.T_world_cam)
+        if fault is not None:
+            raise InputDataError(
+                f"{one.where}: {fault}.",
+                "a rotation and a position in metres.",
+                "take the file of the original recording.",
+            )
+        key = next((key for key, known in cameras.items() if known == one.camera), f"camera{len(cameras)}")
+        cameras[key] = one.camera
+        images[one.name] = PosedImage(camera=key, T_world_cam=matrix4(one.T_world_cam))
+    return CamerasFile(scale=Scale(kind="metric", source="ARKit"), cameras=cameras, images=images)
 
 
 def _stray(source: Path, directory: Path, most: int) -> tuple[list[_Taken], list[str]]:
@@ -110,23 +114,27 @@ def _stray(source: Path, directory: Path, most: int) -> tuple[list[_Taken], list
     for k, frame in enumerate(frames_of(video)):
         if k not in wanted:
             continue
-        height, width = frame.shape[:2]
-        lens = K | poses[k][1]
-        if not (0.2 < lens["cx"] / width < 0.8 and 0.2 < lens["cy"] / height < 0.8):
-            raise InputDataError(
-                f"{video}: {width}x{height} px, but the principal point is ({lens['cx']:.0f}, {lens['cy']:.0f}).",
-                "a video of the size for which camera_matrix.csv was written.",
-                "copy the original video; do not turn or resize it.",
-            )
         name = f"{k:06d}.jpg"
-        write_image(directory / "images" / name, np.ascontiguousarray(frame[:, :, ::-1]), 97)
         where = f"{source / 'odometry.csv'}: frame {k}"
-        camera = CameraIntrinsics.of_lens(where, width=width, height=height, **lens, distortion=())
+        camera = _lens_of_frame(video, where, frame, K | poses[k][1])
+        write_image(directory / "images" / name, np.ascontiguousarray(frame[:, :, ::-1]), 97)
         taken.append(_Taken(name, camera, Z_UP_FROM_Y_UP @ poses[k][0], where))
     depths = {one.name: source / "depth" / f"{Path(one.name).stem}.png" for one in taken}
     _copy_depth(depths, source / "confidence", directory)
     left = len(figures.walked) - len(taken)
     return taken, [f"{left} of {len(figures.walked)} frames are left out (--photos)"] if left else []
+
+
+def _lens_of_frame(video: Path, where: str, frame: NDArray[np.uint8], lens: dict[str, float]) -> CameraIntrinsics:
+    """Return the camera of a frame of the video, whose principal point must lie near its middle."""
+    height, width = frame.shape[:2]
+    if not (0.2 < lens["cx"] / width < 0.8 and 0.2 < lens["cy"] / height < 0.8):
+        raise InputDataError(
+            f"{video}: {width}x{height} px, but the principal point is ({lens['cx']:.0f}, {lens['cy']:.0f}).",
+            "a video of the size for which camera_matrix.csv was written.",
+            "copy the original video; do not turn or resize it.",
+        )
+    return CameraIntrinsics.of_lens(where, width=width, height=height, **lens, distortion=())
 
 
 def _odometry(path: Path) -> dict[int, tuple[NDArray[np.float64], dict[str, float]]]:
@@ -166,11 +174,7 @@ def _matrix(path: Path) -> dict[str, float]:
 def _scenes(source: Path, directory: Path, most: int) -> tuple[list[_Taken], list[str]]:
     times, poses = _trajectory(source / "lowres_wide.traj")
     files = [path for path in entries_of(source / "lowres_wide") if path.suffix.lower() == ".png"]
-    pairs = []
-    for path in files:
-        away = np.abs(times - _time(path))
-        if len(away) and away.min() <= POSE_WITHIN_S:
-            pairs.append((path, poses[int(away.argmin())]))
+    pairs = _with_poses(files, times, poses)
     if not pairs:
         raise InputDataError(
             f"{source}: {len(files)} photos in lowres_wide/, none with a pose in lowres_wide.traj within 5 ms.",
@@ -181,18 +185,34 @@ def _scenes(source: Path, directory: Path, most: int) -> tuple[list[_Taken], lis
     taken, sources = [], []
     for path, pose in (pairs[k] for k in chosen):
         camera = _pincam(source / "lowres_wide_intrinsics", path)
-        if (camera.width, camera.height) != image_size(path):
-            raise InputDataError(
-                f"{path}: not of the size of its .pincam.",
-                f"{camera.width}x{camera.height} px.",
-                "take photo and .pincam of one recording.",
-            )
+        _require_size(path, camera)
         taken.append(_Taken(path.name, camera, pose, f"{source / 'lowres_wide.traj'}: the pose of {path.name}"))
         sources.append(Photo(path, path.name))
     copy_photos(directory, sources)
     _copy_depth({one.name: source / "lowres_depth" / one.name for one in taken}, source / "confidence", directory)
     left = len(files) - len(taken)
     return taken, [f"{left} of {len(files)} photos are left out (--photos, or without a pose)"] if left else []
+
+
+def _with_poses(
+    files: Sequence[Path], times: NDArray[np.float64], poses: Sequence[NDArray[np.float64]]
+) -> list[tuple[Path, NDArray[np.float64]]]:
+    """Return the photos that have a pose of nearly their time, with it."""
+    pairs = []
+    for path in files:
+        away = np.abs(times - _time(path))
+        if len(away) and away.min() <= POSE_WITHIN_S:
+            pairs.append((path, poses[int(away.argmin())]))
+    return pairs
+
+
+def _require_size(path: Path, camera: CameraIntrinsics) -> None:
+    if (camera.width, camera.height) != image_size(path):
+        raise InputDataError(
+            f"{path}: not of the size of its .pincam.",
+            f"{camera.width}x{camera.height} px.",
+            "take photo and .pincam of one recording.",
+        )
 
 
 def _trajectory(path: Path) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:

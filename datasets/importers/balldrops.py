@@ -18,6 +18,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...schemas import Body, InputDataError, Shape, World
 from ...schemas.capture import SphereShape
@@ -70,6 +71,17 @@ def import_balldrops(
 
 
 def _drops(path: Path) -> list[Recording]:
+    drops: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for line, row in _rows(path):
+        name, number, sample = _sample(f"{path}, line {line}", row)
+        if (name, number) not in drops:
+            require_name(name, f"{path}, line {line}")
+        drops.setdefault((name, number), []).append(sample)
+    return [_drop(path, name, number, np.array(samples)) for (name, number), samples in drops.items()]
+
+
+def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
+    """Return the lines below the header, by column, with their numbers."""
     lines = csv_rows(path)
     header = next(lines, (0, []))[1]
     lacking = [column for column in _COLUMNS if column not in header]
@@ -77,29 +89,28 @@ def _drops(path: Path) -> list[Recording]:
     if lacking or not rows:
         what = f"no column '{lacking[0]}'" if lacking else "no rows"
         raise InputDataError(f"{path}: {what}.", f"{', '.join(_COLUMNS)}.", _TODO)
-    drops: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for line, row in rows:
-        try:
-            name = "-".join(row["ball"].lower().split())
-            drop = number_of(row["Drop #"])
-            number = f"{drop:.0f}"
-            if drop != int(drop):
-                raise ValueError
-            sample = number_of(row["Time (s)"]), number_of(row["Height (m)"])
-        except (KeyError, ValueError, OverflowError):
-            raise InputDataError(
-                f"{path}, line {line}: no drop number, time and height.", "numbers.", "correct the line, or remove it."
-            ) from None
-        if (name, number) not in drops:
-            require_name(name, f"{path}, line {line}")
-        drops.setdefault((name, number), []).append(sample)
-    recordings = []
-    for (name, number), samples in drops.items():
-        values = np.array(samples)
-        position = np.c_[np.zeros((len(values), 2)), values[:, 1]]
-        track = Units("m").track(f"{path}: {name}, drop {number}", values[:, 0], position)
-        recordings.append(Recording(name=f"{name}-{number}", tracks={BALL: track}, group=name))
-    return recordings
+    return rows
+
+
+def _sample(where: str, row: dict[str, str]) -> tuple[str, str, tuple[float, float]]:
+    """Return the ball, the number of the drop, and time [s] and height [m] of a line."""
+    try:
+        drop = number_of(row["Drop #"])
+        if drop != int(drop):
+            raise ValueError
+        sample = number_of(row["Time (s)"]), number_of(row["Height (m)"])
+        return "-".join(row["ball"].lower().split()), f"{drop:.0f}", sample
+    except (KeyError, ValueError, OverflowError):
+        raise InputDataError(
+            f"{where}: no drop number, time and height.", "numbers.", "correct the line, or remove it."
+        ) from None
+
+
+def _drop(path: Path, name: str, number: str, values: NDArray[np.float64]) -> Recording:
+    """Return the recording of a drop, of times [s] and heights [m] (T, 2)."""
+    position = np.c_[np.zeros((len(values), 2)), values[:, 1]]
+    track = Units("m").track(f"{path}: {name}, drop {number}", values[:, 0], position)
+    return Recording(name=f"{name}-{number}", tracks={BALL: track}, group=name)
 
 
 def _body(path: Path, balls: list[str], only: str | None) -> Body:
@@ -123,10 +134,8 @@ def _table(path: Path) -> dict[str, tuple[float | None, float | None]]:
             continue
         try:
             name, weight, circumference = words
-            mass = None if weight == "??" else number_of(weight) * _OUNCE_KG
-            radius = None if circumference == "??" else number_of(circumference) * 0.01 / (2 * math.pi)
-            if not all(value is None or 0 < value < math.inf for value in (mass, radius)):
-                raise ValueError
+            mass = _measured(weight, _OUNCE_KG)
+            radius = _measured(circumference, 0.01 / (2 * math.pi))
         except ValueError:
             raise InputDataError(
                 f"{path}, line {number}: {shown(line)}.",
@@ -135,6 +144,18 @@ def _table(path: Path) -> dict[str, tuple[float | None, float | None]]:
             ) from None
         table[_key(name)] = mass, radius
     return table
+
+
+def _measured(text: str, unit: float) -> float | None:
+    """Return a positive number in units; None where it was not measured.
+
+    Raises:
+        ValueError: If it is no such number.
+    """
+    value = None if text == "??" else number_of(text) * unit
+    if value is not None and not 0 < value < math.inf:
+        raise ValueError
+    return value
 
 
 def _key(name: str) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,20 +113,22 @@ def _read(source: Path) -> _Tosses:
     """Find the data: the .pt files in `source`, else an .npz, else the .pt files in `source/tosses`."""
     if source.suffix == ".npz" and not source.is_dir():
         return _read_npz(source)
-    if source.is_dir():
-        for folder in (source, source / "tosses"):
-            files = [path for path in entries_of(folder) if path.suffix == ".pt"]
-            archives = [path for path in entries_of(folder) if path.suffix == ".npz"]
-            if files:
-                return _read_pt(files)
-            if len(archives) == 1:
-                return _read_npz(archives[0])
+    for folder in (source, source / "tosses") if source.is_dir() else ():
+        files, archives = (_ending(folder, suffix) for suffix in (".pt", ".npz"))
+        if files:
+            return _read_pt(files)
+        if len(archives) == 1:
+            return _read_npz(archives[0])
     what = "no such file or directory" if not source.exists() else "no ContactNets tosses"
     raise InputDataError(
         f"{source}: {what}.",
         "a directory of <number>.pt files, or the .npz with " + ", ".join(_NPZ_FIELDS) + ".",
         "get contact-nets' data/tosses_processed from github.com/DAIRLab/contact-nets.",
     )
+
+
+def _ending(folder: Path, suffix: str) -> list[Path]:
+    return [path for path in entries_of(folder) if path.suffix == suffix]
 
 
 def _read_pt(files: list[Path]) -> _Tosses:
@@ -143,6 +147,23 @@ def _read_pt(files: list[Path]) -> _Tosses:
 
 def _read_npz(path: Path) -> _Tosses:
     data = read_npz(path, _NPZ_FIELDS)
+    _require_fields(path, data)
+    offsets, numbers = data["offsets"].astype(np.int64), data["toss_index"].astype(np.int64)
+    if len(offsets) != len(numbers) + 1 or offsets[0] != 0 or offsets[-1] != len(data["pos"]):
+        raise InputDataError(
+            f"{path}: {len(numbers)} toss numbers, {len(offsets)} offsets, {len(data['pos'])} rows.",
+            "one offset more than tosses, from 0 to the number of rows.",
+            "take the original file.",
+        )
+    tracks: dict[int, Track] = {}
+    for number, start, stop in zip(numbers, offsets[:-1], offsets[1:], strict=True):
+        rows = np.concatenate([data[name][start:stop] for name in ("pos", "quat_wxyz", "vel", "omega_body")], axis=1)
+        tracks[int(number)] = _track(f"{path}: toss {number}", rows, float(data["rate_hz"]))
+    return _Tosses(tracks, float(data["half_width_m"]))
+
+
+def _require_fields(path: Path, data: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse arrays of a wrong type or shape, and sizes that are not positive."""
     for name, dimensions in (("offsets", 1), ("toss_index", 1), ("rate_hz", 0), ("half_width_m", 0), ("pos", 2)):
         if data[name].ndim != dimensions or data[name].dtype.kind not in "iuf":
             raise InputDataError(
@@ -161,18 +182,6 @@ def _read_npz(path: Path) -> _Tosses:
             "both > 0.",
             "take the original file.",
         )
-    offsets, numbers = data["offsets"].astype(np.int64), data["toss_index"].astype(np.int64)
-    if len(offsets) != len(numbers) + 1 or offsets[0] != 0 or offsets[-1] != len(data["pos"]):
-        raise InputDataError(
-            f"{path}: {len(numbers)} toss numbers, {len(offsets)} offsets, {len(data['pos'])} rows.",
-            "one offset more than tosses, from 0 to the number of rows.",
-            "take the original file.",
-        )
-    tracks: dict[int, Track] = {}
-    for number, start, stop in zip(numbers, offsets[:-1], offsets[1:], strict=True):
-        rows = np.concatenate([data[name][start:stop] for name in ("pos", "quat_wxyz", "vel", "omega_body")], axis=1)
-        tracks[int(number)] = _track(f"{path}: toss {number}", rows, float(data["rate_hz"]))
-    return _Tosses(tracks, float(data["half_width_m"]))
 
 
 def _track(where: str, rows: Array, rate_hz: float) -> Track:

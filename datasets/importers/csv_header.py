@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -103,6 +103,17 @@ def read_header(path: Path, found: list[str], stated: Conventions) -> Header:
         InputDataError: If it names no columns, lacks a quantity, or its units are unknown or contradict each other.
     """
     names = [name.strip() for name in found]
+    _require_names(path, names)
+    index = {key: k for key in COLUMNS if (k := _place(path, names, key, stated)) is not None}
+    if stated.euler is None or QUATERNION[0] in index:  # nothing says in which order they turn, or they are not needed
+        index = {key: k for key, k in index.items() if key not in EULER}
+    _require_columns(path, names, index, stated)
+    angles = _angle_unit(path, [names[index[key]] for key in EULER if key in index], stated.angle_unit)
+    return Header(index, _units(path, names, index, stated), angles)
+
+
+def _require_names(path: Path, names: list[str]) -> None:
+    """Refuse a first line that names nothing: an empty one, or one of numbers."""
     if not any(names):
         raise InputDataError(
             f"{path}: empty, without a first line that names the columns.",
@@ -115,12 +126,6 @@ def read_header(path: Path, found: list[str], stated: Conventions) -> Header:
             "a first line with the names of the columns, such as time,px,py,pz,qw,qx,qy,qz.",
             f"put such a line first, for example: sed -i '1i time,px,py,pz' '{path}'",
         )
-    index = {key: k for key in COLUMNS if (k := _place(path, names, key, stated)) is not None}
-    if stated.euler is None or QUATERNION[0] in index:  # nothing says in which order they turn, or they are not needed
-        index = {key: k for key, k in index.items() if key not in EULER}
-    _require_columns(path, names, index, stated)
-    angles = _angle_unit(path, [names[index[key]] for key in EULER if key in index], stated.angle_unit)
-    return Header(index, _units(path, names, index, stated), angles)
 
 
 def is_number(text: str) -> bool:
@@ -135,13 +140,7 @@ def is_number(text: str) -> bool:
 def _require_columns(path: Path, names: list[str], index: Mapping[str, int], stated: Conventions) -> None:
     """Check that time and position have columns, and either all or none of orientation, spin and force."""
     required = REQUIRED if stated.frame_rate_hz is None else REQUIRED[1:]
-    lacking = [key for key in required if key not in index]
-    group: tuple[str, ...] = QUATERNION
-    if stated.euler is not None and not lacking and not {QUATERNION[0], *EULER} & set(index):
-        group, lacking = EULER, list(EULER)
-    for some in (QUATERNION, EULER, SPIN, FORCE):
-        if not lacking and any(key in index for key in some):
-            group, lacking = some, [key for key in some if key not in index]
+    lacking, group = _lacking(required, index, stated)
     if lacking:
         rate = " Without times: --frame-rate HZ." if lacking[0] == "time" else ""
         raise InputDataError(
@@ -151,34 +150,54 @@ def _require_columns(path: Path, names: list[str], index: Mapping[str, int], sta
         )
 
 
+def _lacking(
+    required: Sequence[str], index: Mapping[str, int], stated: Conventions
+) -> tuple[list[str], tuple[str, ...]]:
+    """Return the quantities that have no column, and the group of which a file has all or none; none lack: empty."""
+    if lacking := [key for key in required if key not in index]:
+        return lacking, QUATERNION
+    if stated.euler is not None and not {QUATERNION[0], *EULER} & set(index):
+        return list(EULER), EULER
+    for group in (QUATERNION, EULER, SPIN, FORCE):
+        lacking = [key for key in group if key not in index]
+        if 0 < len(lacking) < len(group):
+            return lacking, group
+    return [], QUATERNION
+
+
 def _units(path: Path, names: list[str], index: Mapping[str, int], stated: Conventions) -> Units:
     """Return the units of the options and of the column names, which must not contradict each other."""
     units = stated.units
     for kind, legal, keys in (("length", LENGTHS_M, REQUIRED[1:]), ("time", TIMES_S, REQUIRED[:1])):
         held = [names[index[key]] for key in keys if key in index]
         by_name = {name: unit for name in held if (unit := _plain(name)[1]) in legal}
-        silent = [name for name in held if name not in by_name]
         if by_name and kind == "time" and stated.frame_rate_hz is not None:
             raise InputDataError(
                 f"{path}: {shown(held[0])} names a unit of time, and --frame-rate says that it counts frames.",
                 "one of the two.",
                 "leave --frame-rate out, or name the column of the frames: --columns time=NAME.",
             )
-        if by_name and silent and getattr(units, kind) is None:
-            raise InputDataError(
-                f"{path}: '{next(iter(by_name))}' names its unit, and {' and '.join(map(shown, silent))} none.",
-                f"a unit in all of {', '.join(held)}, or in none.",
-                f"rename the columns, or state it for all: --{kind}-unit {next(iter(by_name.values()))}.",
-            )
-        named = set(by_name.values()) | ({getattr(units, kind)} - {None})
-        if len(named) > 1:
-            raise InputDataError(
-                f"{path}: units of {kind} that differ: {', '.join(sorted(named))}.",
-                "one unit for all columns.",
-                "convert the columns to one unit, and name it in the first line.",
-            )
-        units = replace(units, **{kind: next(iter(named), None)})
+        units = replace(units, **{kind: _one_unit(path, kind, held, by_name, getattr(units, kind))})
     return units
+
+
+def _one_unit(path: Path, kind: str, held: list[str], by_name: Mapping[str, str], stated: str | None) -> str | None:
+    """Return the unit of the columns `held`, which the names of some say, or the user; None where nothing does."""
+    silent = [name for name in held if name not in by_name]
+    if by_name and silent and stated is None:
+        raise InputDataError(
+            f"{path}: '{next(iter(by_name))}' names its unit, and {' and '.join(map(shown, silent))} none.",
+            f"a unit in all of {', '.join(held)}, or in none.",
+            f"rename the columns, or state it for all: --{kind}-unit {next(iter(by_name.values()))}.",
+        )
+    named = set(by_name.values()) | ({stated} - {None})
+    if len(named) > 1:
+        raise InputDataError(
+            f"{path}: units of {kind} that differ: {', '.join(sorted(map(str, named)))}.",
+            "one unit for all columns.",
+            "convert the columns to one unit, and name it in the first line.",
+        )
+    return next(iter(named), None)
 
 
 def _angle_unit(path: Path, names: list[str], stated: AngleUnit | None) -> AngleUnit | None:
@@ -196,13 +215,7 @@ def _angle_unit(path: Path, names: list[str], stated: AngleUnit | None) -> Angle
 def _place(path: Path, names: list[str], key: str, stated: Conventions) -> int | None:
     """Return the index of the column with the quantity `key`, or None."""
     if key in stated.columns:
-        if stated.columns[key] not in names:
-            raise InputDataError(
-                f"{path}: no column '{stated.columns[key]}' (--columns {key}={stated.columns[key]}).",
-                f"{', '.join(names)}.",
-                f"choose one of these: --columns {key}=NAME.",
-            )
-        return names.index(stated.columns[key])
+        return _stated_place(path, names, key, stated.columns[key])
     hits = [k for k, name in enumerate(names) if _quantity(name, key) in _NAMES[key]]
     if key == "time" and stated.frame_rate_hz is not None:
         hits = [k for k, name in enumerate(names) if _plain(name)[0] in _FRAMES] or hits
@@ -213,6 +226,17 @@ def _place(path: Path, names: list[str], key: str, stated: Conventions) -> int |
             f"choose: --columns {key}=NAME.",
         )
     return hits[0] if hits else None
+
+
+def _stated_place(path: Path, names: list[str], key: str, name: str) -> int:
+    """Return the index of the column that the user names for the quantity `key`."""
+    if name not in names:
+        raise InputDataError(
+            f"{path}: no column '{name}' (--columns {key}={name}).",
+            f"{', '.join(names)}.",
+            f"choose one of these: --columns {key}=NAME.",
+        )
+    return names.index(name)
 
 
 def _quantity(name: str, key: str) -> str:

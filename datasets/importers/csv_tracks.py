@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -79,13 +79,7 @@ def import_csv(
     stated = Conventions(columns or {}, units, frame_rate_hz, euler, angle_unit)
     stated.check()
     with new_directory(out, "capture", overwrite) as directory:
-        for name in columns or {}:
-            if name not in COLUMNS:
-                raise InputDataError(
-                    f"--columns: '{name}' is nothing that a column can be.",
-                    f"{', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}",
-                    "correct it, or leave it out.",
-                )
+        _require_quantities(columns or {})
         files = track_files(Path(source), (".csv",))
         left_out: Counter[str] = Counter()
         renamed: dict[str, str] = {}
@@ -93,6 +87,17 @@ def import_csv(
         result = write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
     said = (*_left_out_warnings(left_out, len(files), euler), *_renamed_warnings(renamed))
     return result.model_copy(update={"warnings": (*result.warnings, *said)})
+
+
+def _require_quantities(columns: Mapping[str, str]) -> None:
+    """Refuse columns named for what no column can be."""
+    for name in columns:
+        if name not in COLUMNS:
+            raise InputDataError(
+                f"--columns: '{name}' is nothing that a column can be.",
+                f"{', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}",
+                "correct it, or leave it out.",
+            )
 
 
 def _left_out_warnings(left_out: Counter[str], files: int, euler: str | None) -> tuple[str, ...]:
@@ -133,13 +138,14 @@ def _tracks(
     by_body = _samples(path, header, len(names), rows, body, renamed)
     if not by_body:
         raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
-    tracks = {}
-    for name, values in by_body.items():
-        parts = _Parts.of(header, np.array(values), stated)
-        where = f"{path}: {name}"
-        track = header.units.track(where, parts.time, parts.position, parts.quat, parts.omega, parts.force)
-        tracks[name] = _with_body_spin(track) if spin_frame == "world" else track
-    return tracks
+    tracks = {name: _track(f"{path}: {name}", header, np.array(values), stated) for name, values in by_body.items()}
+    return {name: _with_body_spin(track) for name, track in tracks.items()} if spin_frame == "world" else tracks
+
+
+def _track(where: str, header: Header, table: Array, stated: Conventions) -> Track:
+    """Return the track of a body from its numbers, a line for each sample."""
+    parts = _Parts.of(header, table, stated)
+    return header.units.track(where, parts.time, parts.position, parts.quat, parts.omega, parts.force)
 
 
 def _without_comments(text: str) -> tuple[str, str]:
@@ -152,11 +158,15 @@ def _without_comments(text: str) -> tuple[str, str]:
     separator = max(",;\t", key=lines[count].count)
     if count:
         names = lines[count - 1].lstrip().lstrip("#").strip()
-        cells = lines[count].split(separator)
-        numbers = all(is_number(cell.strip()) or _DECIMAL_COMMA.match(cell.strip()) for cell in cells)
-        named = numbers and len(names.split(separator)) == len(cells)
+        named = _are_names_of(names.split(separator), lines[count].split(separator))
         lines[:count] = [""] * (count - 1) + [names if named else ""]
     return "\n".join(lines), separator
+
+
+def _are_names_of(names: Sequence[str], cells: Sequence[str]) -> bool:
+    """Return whether cells are as many numbers as there are names."""
+    numbers = all(is_number(cell.strip()) or _DECIMAL_COMMA.match(cell.strip()) for cell in cells)
+    return numbers and len(names) == len(cells)
 
 
 @dataclass(frozen=True)

@@ -68,13 +68,7 @@ def import_hdf5(
         UsageError: If `out` exists, before anything is read.
     """
     with new_directory(out, "capture", overwrite) as directory:
-        for name in columns or {}:
-            if name not in SETS:
-                raise InputDataError(
-                    f"--columns: '{name}' is nothing that a set can be.",
-                    f"{', '.join(SETS)}.{did_you_mean(name, SETS)}",
-                    "correct the name before the =.",
-                )
+        _require_sets(columns or {})
         require_name(body, "--body")
         files = track_files(Path(source), (".h5", ".hdf5"))
         found = [(path, name, track) for path in files for name, track in _episodes(path, columns or {}, units)]
@@ -82,6 +76,17 @@ def import_hdf5(
         stems = [f"{path.stem}-{name}" if several else name for path, name, _ in found]
         tracks = ({body: track} for _, _, track in found)
         return write_tracks(directory, out, stems, tracks, up, (n_train, n_test, seed))
+
+
+def _require_sets(columns: Mapping[str, str]) -> None:
+    """Refuse names given for what no set can be."""
+    for name in columns:
+        if name not in SETS:
+            raise InputDataError(
+                f"--columns: '{name}' is nothing that a set can be.",
+                f"{', '.join(SETS)}.{did_you_mean(name, SETS)}",
+                "correct the name before the =.",
+            )
 
 
 def _episodes(path: Path, columns: Mapping[str, str], units: Units) -> list[tuple[str, Track]]:
@@ -92,15 +97,8 @@ def _episodes(path: Path, columns: Mapping[str, str], units: Units) -> list[tupl
         for name, item in own_objects(file, f"{path}: "):
             groups.append(item) if isinstance(item, h5py.Group) else seen.append(name)
         for group in groups:
-            found = {key: _found(group, key, columns) for key in SETS}
-            if found["time"] is None or found["position"] is None:
-                continue
-            where = f"{path}: {group.name}"
-            sets = {key: None if item is None else _numbers(path, item, key) for key, item in found.items()}
-            quat = _orientation(where, group, sets["quat_wxyz"], sets["quat_xyzw"])
-            assert sets["time"] is not None and sets["position"] is not None  # looked at above
-            track = units.track(where, sets["time"], sets["position"], quat)
-            tracks.append((str(group.name).strip("/").replace("/", "-") or path.stem, track))
+            if (track := _track(path, group, columns, units)) is not None:
+                tracks.append((str(group.name).strip("/").replace("/", "-") or path.stem, track))
     if not tracks:
         shown = ", ".join(seen[:8]) + (", ..." if len(seen) > 8 else "")
         raise InputDataError(
@@ -109,6 +107,18 @@ def _episodes(path: Path, columns: Mapping[str, str], units: Units) -> list[tupl
             "name them: --columns time=NAME,position=NAME,quat_wxyz=NAME.",
         )
     return tracks
+
+
+def _track(path: Path, group: h5py.Group, columns: Mapping[str, str], units: Units) -> Track | None:
+    """Return the track of a group; None of one without times or positions."""
+    found = {key: _found(group, key, columns) for key in SETS}
+    if found["time"] is None or found["position"] is None:
+        return None
+    sets = {key: None if item is None else _numbers(path, item, key) for key, item in found.items()}
+    assert sets["time"] is not None and sets["position"] is not None  # looked at above
+    where = f"{path}: {group.name}"
+    quat = _orientation(where, group, sets["quat_wxyz"], sets["quat_xyzw"])
+    return units.track(where, sets["time"], sets["position"], quat)
 
 
 def _found(group: h5py.Group, key: str, columns: Mapping[str, str]) -> h5py.Dataset | None:

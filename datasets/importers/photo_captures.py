@@ -42,29 +42,39 @@ def photos_in(folder: Path) -> list[Photo]:
     Raises:
         InputDataError: If there is none, or two would have one name.
     """
-    if not folder.is_dir():
-        is_file = folder.is_file()
-        todo = f"name the folder that holds the photos (a video: cgwm import video {typed_path(folder)})."
-        raise InputDataError(
-            f"{folder}: {'is a file' if is_file else 'no such folder'}.",
-            "a folder of photos.",
-            todo if is_file else "check the path.",
-        )
+    _require_folder(folder)
     files = [path for path in entries_of(folder) if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
     if not files:
-        entries = entries_of(folder)
-        others = sorted({path.suffix for path in entries if path.suffix})
-        posed = any(path.name == "transforms.json" for path in entries)
-        within = next((path for path in entries if path.name == "images" and path.is_dir()), None)
-        todo = "name the folder that holds them" + (f": {within}" if within else "")
-        raise InputDataError(
-            f"{folder}: no photos" + (f", but files {', '.join(others[:6])}." if others else "."),
-            "photos .jpg, .jpeg, .png, .heic or .heif.",
-            f"{todo}, or with their cameras: cgwm import nerfstudio {typed_path(folder)}." if posed else f"{todo}.",
-        )
+        raise _no_photos(folder)
     photos = [Photo(path, f"{path.stem}.jpg" if _is_heif(path) else path.name) for path in files]
     require_distinct(photos)
     return photos
+
+
+def _require_folder(folder: Path) -> None:
+    if folder.is_dir():
+        return
+    is_file = folder.is_file()
+    todo = f"name the folder that holds the photos (a video: cgwm import video {typed_path(folder)})."
+    raise InputDataError(
+        f"{folder}: {'is a file' if is_file else 'no such folder'}.",
+        "a folder of photos.",
+        todo if is_file else "check the path.",
+    )
+
+
+def _no_photos(folder: Path) -> InputDataError:
+    """Return the error of a folder without photos, which says what is in it instead."""
+    entries = entries_of(folder)
+    others = sorted({path.suffix for path in entries if path.suffix})
+    posed = any(path.name == "transforms.json" for path in entries)
+    within = next((path for path in entries if path.name == "images" and path.is_dir()), None)
+    todo = "name the folder that holds them" + (f": {within}" if within else "")
+    return InputDataError(
+        f"{folder}: no photos" + (f", but files {', '.join(others[:6])}." if others else "."),
+        "photos .jpg, .jpeg, .png, .heic or .heif.",
+        f"{todo}, or with their cameras: cgwm import nerfstudio {typed_path(folder)}." if posed else f"{todo}.",
+    )
 
 
 def require_distinct(photos: Iterable[Photo]) -> None:

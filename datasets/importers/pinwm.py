@@ -139,17 +139,11 @@ def import_pinwm(source: Path | str, out: Path | str, n_train: int = 12, overwri
     with new_directory(out, "capture", overwrite) as directory:
         recordings = _recordings(source, n_train)
         filmed = [recording for recording in recordings if recording.frames]
-        shape, mass_kg, com_m = _link(source, _BLOCK_URDF)
-        write_obj(directory / "block.obj", shape)
-        write_obj(directory / "pusher.obj", widened(hull(_link(source, _PUSHER_URDF)[0]), 2 * MARGIN_M))
         train = {f"{recording.name}{FIRST}": recording for recording in filmed}
         manifest = CaptureManifest(
             format="cgwm-capture/1",
             world=World(ground=Ground(offset_m=2 * MARGIN_M)),
-            bodies=(
-                Body(name=BLOCK, mass_kg=mass_kg, com_m=com_m, shape=Shape(mesh=FileShape(path="block.obj"))),
-                Body(name=PUSHER, motion="driven", shape=Shape(mesh=FileShape(path="pusher.obj"))),
-            ),
+            bodies=_bodies(source, directory),
             splits={"train": tuple(train), "test": tuple(recording.name for recording in recordings)},
             video=Video(frame_rate_hz=RATE_HZ),
         )
@@ -168,6 +162,17 @@ def import_pinwm(source: Path | str, out: Path | str, n_train: int = 12, overwri
         episodes=len(train) + len(recordings),
         samples=samples,
         splits={name: len(episodes) for name, episodes in manifest.splits.items()},
+    )
+
+
+def _bodies(source: Path, directory: Path) -> tuple[Body, Body]:
+    """Write the shapes of block and pusher, and return their entries of the manifest."""
+    shape, mass_kg, com_m = _link(source, _BLOCK_URDF)
+    write_obj(directory / "block.obj", shape)
+    write_obj(directory / "pusher.obj", widened(hull(_link(source, _PUSHER_URDF)[0]), 2 * MARGIN_M))
+    return (
+        Body(name=BLOCK, mass_kg=mass_kg, com_m=com_m, shape=Shape(mesh=FileShape(path="block.obj"))),
+        Body(name=PUSHER, motion="driven", shape=Shape(mesh=FileShape(path="pusher.obj"))),
     )
 
 
@@ -304,20 +309,27 @@ def _link(source: Path, place: str) -> tuple[Mesh, float, tuple[float, float, fl
         mesh, mass = link.find("collision/geometry/mesh"), link.find("inertial/mass")
         if mesh is None or mass is None:
             continue
-        origin = link.find("inertial/origin")
-        try:
-            x, y, z = map(number_of, ("0 0 0" if origin is None else origin.get("xyz", "0 0 0")).split())
-            mass_kg = number_of(mass.get("value", ""))
-            if not (0 < mass_kg < math.inf and math.isfinite(x + y + z)):
-                raise ValueError("a mass that is not positive, or a place that is not finite")
-        except ValueError as error:
-            raise InputDataError(
-                f"{urdf}: inertial: {error}.", "a mass [kg] and a centre of mass [m].", "take the original file."
-            ) from None
+        mass_kg, com_m = _inertial(urdf, mass, link.find("inertial/origin"))
         path = urdf.parent / mesh.get("filename", "")
         _require_inside(path, source, str(urdf))
-        return read_mesh(path), mass_kg, (x, y, z)
+        return read_mesh(path), mass_kg, com_m
     raise InputDataError(f"{urdf}: no link with a mesh and a mass.", todo=_TODO)
+
+
+def _inertial(
+    urdf: Path, mass: ElementTree.Element, origin: ElementTree.Element | None
+) -> tuple[float, tuple[float, float, float]]:
+    """Return the mass [kg] and the centre of mass [m] of a link."""
+    try:
+        x, y, z = map(number_of, ("0 0 0" if origin is None else origin.get("xyz", "0 0 0")).split())
+        mass_kg = number_of(mass.get("value", ""))
+        if not (0 < mass_kg < math.inf and math.isfinite(x + y + z)):
+            raise ValueError("a mass that is not positive, or a place that is not finite")
+    except ValueError as error:
+        raise InputDataError(
+            f"{urdf}: inertial: {error}.", "a mass [kg] and a centre of mass [m].", "take the original file."
+        ) from None
+    return mass_kg, (x, y, z)
 
 
 def _cameras(filmed: list[_Recording]) -> CamerasFile:

@@ -105,24 +105,10 @@ class Units:
         _require_as_many(
             where, times=time, positions=position, orientations=quat_wxyz, spins=omega_rad_s, forces=force_n
         )
-        seen = np.asarray(np.isfinite(position).all(1))
-        if quat_wxyz is not None:
-            seen &= np.isfinite(quat_wxyz).all(1)
-        known = np.flatnonzero(seen)
-        if len(known) and (outside := len(seen) - (known[-1] - known[0] + 1)):  # gaps inside: `gap_warnings`
-            note(f"{where}: {outside} samples before the first pose or after the last one are left out")
+        seen = _with_a_pose(where, position, quat_wxyz)
         time, position = time[seen], position[seen]
-        if len(time) < 2:
-            raise InputDataError(
-                f"{where}: {len(time)} samples with a pose.", "at least 2.", "leave this recording out."
-            )
-        if not np.isfinite(time).all():
-            raise InputDataError(
-                f"{where}: {np.count_nonzero(~np.isfinite(time))} times are not finite.",
-                "a finite time for each sample.",
-                "remove these samples, or take the original.",
-            )
-        self._check(where, time, position)
+        _require_times(where, time)
+        self._require_likely(where, time, position)
         omega = None if omega_rad_s is None else _spin(where, omega_rad_s[seen])
         quat = None if quat_wxyz is None else _unit(where, quat_wxyz[seen])
         track = Track(
@@ -132,31 +118,12 @@ class Units:
             omega_body_rad_s=omega,
             force_n=None if force_n is None else _force(where, force_n[seen]),
         )
-        for name, unit, values in (("times", "s", track.time_s), ("positions", "m", track.position_m)):
-            if (largest := float(np.abs(values).max())) > LARGEST:
-                raise InputDataError(
-                    f"{where}: {name} up to {largest:.4g} {unit}.",
-                    f"up to {LARGEST:g} {unit}.",
-                    "check the unit and the samples, and leave out wrong ones.",
-                )
-        if (shortest := float(np.diff(track.time_s).min())) < SHORTEST_STEP_S:
-            raise InputDataError(
-                f"{where}: two times are {shortest:.2g} s apart.",
-                f"{SHORTEST_STEP_S:g} s or more.",
-                "check the unit of the times, and remove repeated samples.",
-            )
+        _require_in_range(where, track)
         return track
 
-    def _check(self, where: str, time: Array, position: Array) -> None:
-        steps = np.diff(time)
-        if (bad := np.flatnonzero(steps <= 0)).size:
-            k = int(bad[0])
-            raise InputDataError(
-                f"{where}: time {time[k + 1]:.15g} comes after {time[k]:.15g} ({bad.size} of {len(time)} are so).",
-                "times that increase from sample to sample.",
-                "remove the samples that are there twice." if (steps >= 0).all() else "sort the samples by time.",
-            )
-        step, spread = float(np.median(steps)), float(np.ptp(position, axis=0).max())
+    def _require_likely(self, where: str, time: Array, position: Array) -> None:
+        """Refuse numbers that are hardly seconds or metres where nobody said that they are."""
+        step, spread = float(np.median(np.diff(time))), float(np.ptp(position, axis=0).max())
         if self.time is None and step >= _SLOWEST_STEP_S:
             unit = "ms" if step < 500 else "us" if step < 5e5 else "ns"
             raise InputDataError(
@@ -173,6 +140,54 @@ class Units:
                 "metres, or another unit that is named.",
                 "add --length-unit mm (or, if these are metres: --length-unit m).",
             )
+
+
+def _with_a_pose(where: str, position: Array, quat_wxyz: Array | None) -> NDArray[np.bool_]:
+    """Return which samples (T,) have a pose, and say how many at the ends have none."""
+    seen = np.asarray(np.isfinite(position).all(1))
+    if quat_wxyz is not None:
+        seen &= np.isfinite(quat_wxyz).all(1)
+    known = np.flatnonzero(seen)
+    if len(known) and (outside := len(seen) - (known[-1] - known[0] + 1)):  # gaps inside: `gap_warnings`
+        note(f"{where}: {outside} samples before the first pose or after the last one are left out")
+    return seen
+
+
+def _require_times(where: str, time: Array) -> None:
+    """Refuse times of samples that are too few, not finite, or do not increase."""
+    if len(time) < 2:
+        raise InputDataError(f"{where}: {len(time)} samples with a pose.", "at least 2.", "leave this recording out.")
+    if not np.isfinite(time).all():
+        raise InputDataError(
+            f"{where}: {np.count_nonzero(~np.isfinite(time))} times are not finite.",
+            "a finite time for each sample.",
+            "remove these samples, or take the original.",
+        )
+    steps = np.diff(time)
+    if (bad := np.flatnonzero(steps <= 0)).size:
+        k = int(bad[0])
+        raise InputDataError(
+            f"{where}: time {time[k + 1]:.15g} comes after {time[k]:.15g} ({bad.size} of {len(time)} are so).",
+            "times that increase from sample to sample.",
+            "remove the samples that are there twice." if (steps >= 0).all() else "sort the samples by time.",
+        )
+
+
+def _require_in_range(where: str, track: Track) -> None:
+    """Refuse a track with numbers that are too large, or with times too close to each other."""
+    for name, unit, values in (("times", "s", track.time_s), ("positions", "m", track.position_m)):
+        if (largest := float(np.abs(values).max())) > LARGEST:
+            raise InputDataError(
+                f"{where}: {name} up to {largest:.4g} {unit}.",
+                f"up to {LARGEST:g} {unit}.",
+                "check the unit and the samples, and leave out wrong ones.",
+            )
+    if (shortest := float(np.diff(track.time_s).min())) < SHORTEST_STEP_S:
+        raise InputDataError(
+            f"{where}: two times are {shortest:.2g} s apart.",
+            f"{SHORTEST_STEP_S:g} s or more.",
+            "check the unit of the times, and remove repeated samples.",
+        )
 
 
 SI = Units()
@@ -284,24 +299,35 @@ def drawn_splits(
     Raises:
         InputDataError: If there are fewer episodes.
     """
+    order = _in_turn(recordings, seed)
+    n_train, n_test = _sizes(len(order), n_train, n_test)
+    splits = {"train": tuple(order[:n_train]), "test": tuple(order[n_train : n_train + n_test])}
+    return {name: episodes for name, episodes in splits.items() if episodes}
+
+
+def _in_turn(recordings: Sequence[Recording], seed: int) -> list[str]:
+    """Return the names of the episodes, each group permuted by the seed, one of each group in turn."""
     rng = np.random.default_rng(seed)
     groups: dict[str | None, list[str]] = {}
     for recording in recordings:
         groups.setdefault(recording.group, []).append(recording.name)
     shuffled = [[names[k] for k in rng.permutation(len(names))] for names in groups.values()]
     longest = max(map(len, shuffled))
-    order = [names[k] for k in range(longest) for names in shuffled if k < len(names)]
+    return [names[k] for k in range(longest) for names in shuffled if k < len(names)]
+
+
+def _sizes(episodes: int, n_train: int | None, n_test: int | None) -> tuple[int, int]:
+    """Return how many episodes are to train and to test on; without an answer, a share and all others."""
     if n_train is None:
-        n_train = len(order) - n_test if n_test is not None else math.ceil(_TRAIN_SHARE * len(order))
-    n_test = len(order) - n_train if n_test is None else n_test
-    if n_train < 1 or n_test < 0 or n_train + n_test > len(order):
+        n_train = episodes - n_test if n_test is not None else math.ceil(_TRAIN_SHARE * episodes)
+    n_test = episodes - n_train if n_test is None else n_test
+    if n_train < 1 or n_test < 0 or n_train + n_test > episodes:
         raise InputDataError(
-            f"{max(n_train, 0)} training and {max(n_test, 0)} test episodes of {len(order)} recordings.",
-            f"at least 1 to train on, and no more than {len(order)} together.",
+            f"{max(n_train, 0)} training and {max(n_test, 0)} test episodes of {episodes} recordings.",
+            f"at least 1 to train on, and no more than {episodes} together.",
             "change --train or --test, or leave them out.",
         )
-    splits = {"train": tuple(order[:n_train]), "test": tuple(order[n_train : n_train + n_test])}
-    return {name: episodes for name, episodes in splits.items() if episodes}
+    return n_train, n_test
 
 
 def write_recordings(
@@ -340,26 +366,30 @@ def gap_warnings(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
     Samples without a pose leave gaps, and so do frames that a camera dropped.
     """
-    found = []
-    for recording in recordings:
-        for body, track in recording.tracks.items():
-            steps = np.diff(track.time_s)
-            usual = float(np.median(steps)) if len(steps) else 0.0
-            gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
-            if not len(gaps):
-                continue
-            missing = int(np.rint(steps[gaps] / usual).sum()) - len(gaps)
-            k = gaps[np.argmax(steps[gaps])]
-            name = recording.name if len(recording.tracks) == 1 else f"{recording.name} ({body})"
-            where = f"the longest of {1e3 * steps[k]:.3g} ms at {track.time_s[k]:.3f} s"
-            found.append(
-                (missing, f"{name} lacks {missing} of {missing + len(track)} samples in {_count(len(gaps))}, {where}")
-            )
+    named = [
+        (recording.name if len(recording.tracks) == 1 else f"{recording.name} ({body})", track)
+        for recording in recordings
+        for body, track in recording.tracks.items()
+    ]
+    found = [gaps for name, track in named if (gaps := _gaps(name, track)) is not None]
     if not found:
         return ()
     worst = [words for _, words in sorted(found, key=lambda one: -one[0])[:_GAPS_NAMED]]
     more = f"; {len(found) - len(worst)} further tracks have gaps, too" if len(found) > len(worst) else ""
     return (f"samples are missing: {'; '.join(worst)}{more}. Gaps are allowed: nothing is filled in.",)
+
+
+def _gaps(name: str, track: Track) -> tuple[int, str] | None:
+    """Return how many samples a track lacks, and the words that say so; None without a gap."""
+    steps = np.diff(track.time_s)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
+    if not len(gaps):
+        return None
+    missing = int(np.rint(steps[gaps] / usual).sum()) - len(gaps)
+    k = gaps[np.argmax(steps[gaps])]
+    where = f"the longest of {1e3 * steps[k]:.3g} ms at {track.time_s[k]:.3f} s"
+    return missing, f"{name} lacks {missing} of {missing + len(track)} samples in {_count(len(gaps))}, {where}"
 
 
 def _count(gaps: int) -> str:

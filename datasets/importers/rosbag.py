@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -76,16 +76,11 @@ def import_rosbag(
 
 
 def _bags(source: Path) -> list[Path]:
-    def is_bag(path: Path) -> bool:
-        if path.is_dir():
-            return optional_file(path / "metadata.yaml") is not None
-        return path.suffix in (".bag", ".mcap") and require_regular_file(path) == path
-
     there = os.path.lexists(source)
-    bags = [source] if there and is_bag(source) else []
-    bags = bags or [path for path in (entries_of(source) if source.is_dir() else ()) if is_bag(path)]
+    entries = entries_of(source) if source.is_dir() else []
+    bags = [source] if there and _is_bag(source) else [path for path in entries if _is_bag(path)]
     if not bags:
-        messages = next((p for p in (entries_of(source) if source.is_dir() else ()) if p.suffix == ".db3"), None)
+        messages = next((path for path in entries if path.suffix == ".db3"), None)
         what = f"no ROS bags{f', but {messages} without metadata.yaml' if messages else ''}"
         raise InputDataError(
             f"{source}: {what if there else 'no such file or directory'}.",
@@ -95,24 +90,15 @@ def _bags(source: Path) -> list[Path]:
     return bags
 
 
+def _is_bag(path: Path) -> bool:
+    if path.is_dir():
+        return optional_file(path / "metadata.yaml") is not None
+    return path.suffix in (".bag", ".mcap") and require_regular_file(path) == path
+
+
 def _track(path: Path, topic: str | None) -> Track:
-    rosbags: Any = import_module("rosbags.highlevel")
-    stores: Any = import_module("rosbags.typesys")
-    for name in files_under(path) if path.is_dir() else ():  # each must be a regular file
-        require_regular_file(path / name)
-    try:
-        with rosbags.AnyReader([path], default_typestore=stores.get_typestore(stores.Stores.LATEST)) as reader:
-            name, frame = _chosen(path, reader, topic)
-            rows = list(_poses(reader, name, frame))
-    except InputDataError:
-        raise
-    except Exception as error:  # the readers raise what their parsers raise: of struct, yaml, sqlite, their own
-        reason = str(error)[:160].rstrip(".") or type(error).__name__
-        raise InputDataError(
-            f"{path}: not a ROS bag that can be read: {reason}.",
-            "a whole .bag or .mcap, or a directory with metadata.yaml and the files that it names.",
-            "record or copy it again; 'rosbag reindex' or 'ros2 bag reindex' mends one that was cut off.",
-        ) from None
+    """Return the track on a topic; poses with the time of the one before are left out."""
+    rows, name, frame = _read(path, topic)
     if not rows:
         shown = f" of '{frame}'" if frame else ""
         raise InputDataError(f"{path}: no poses{shown} on {name}.", todo="choose another: --topic NAME.")
@@ -126,6 +112,27 @@ def _track(path: Path, topic: str | None) -> Track:
     return Units("m", "s").track(f"{path}: {name}", 1e-9 * (table[:, 0] - first), table[:, 1:4], table[:, 4:])
 
 
+def _read(path: Path, topic: str | None) -> tuple[list[list[float]], str, str]:
+    """Return the poses on a topic, as `_poses` yields them, and the topic and child frame that were chosen."""
+    rosbags: Any = import_module("rosbags.highlevel")
+    stores: Any = import_module("rosbags.typesys")
+    for name in files_under(path) if path.is_dir() else ():  # each must be a regular file
+        require_regular_file(path / name)
+    try:
+        with rosbags.AnyReader([path], default_typestore=stores.get_typestore(stores.Stores.LATEST)) as reader:
+            name, frame = _chosen(path, reader, topic)
+            return list(_poses(reader, name, frame)), name, frame
+    except InputDataError:
+        raise
+    except Exception as error:  # the readers raise what their parsers raise: of struct, yaml, sqlite, their own
+        reason = str(error)[:160].rstrip(".") or type(error).__name__
+        raise InputDataError(
+            f"{path}: not a ROS bag that can be read: {reason}.",
+            "a whole .bag or .mcap, or a directory with metadata.yaml and the files that it names.",
+            "record or copy it again; 'rosbag reindex' or 'ros2 bag reindex' mends one that was cut off.",
+        ) from None
+
+
 def _chosen(path: Path, reader: Any, topic: str | None) -> tuple[str, str]:
     """Return the topic, and the child frame where it holds transforms."""
     kinds = {connection.topic: connection.msgtype for connection in reader.connections}
@@ -136,10 +143,14 @@ def _chosen(path: Path, reader: Any, topic: str | None) -> tuple[str, str]:
     if name in poses or (frame and kinds.get(name) == TRANSFORMS):
         return name, frame
     transforms = [f"{name}:CHILD_FRAME" for name, kind in kinds.items() if kind == TRANSFORMS]
-    legal = [*poses, *sorted(transforms)]
-    found = f"no topic of poses '{topic}'" if topic else f"{len(poses)} topics of poses"
+    raise _no_such_topic(path, topic, len(poses), [*poses, *sorted(transforms)])
+
+
+def _no_such_topic(path: Path, topic: str | None, poses: int, legal: Sequence[str]) -> InputDataError:
+    """Return the error of a topic that is not in a bag, or that must be chosen of several."""
+    found = f"no topic of poses '{topic}'" if topic else f"{poses} topics of poses"
     nearest = did_you_mean(topic or "", legal)
-    raise InputDataError(f"{path}: {found}.", f"{', '.join(legal) or 'none is in it'}.{nearest}", "add --topic NAME.")
+    return InputDataError(f"{path}: {found}.", f"{', '.join(legal) or 'none is in it'}.{nearest}", "add --topic NAME.")
 
 
 def _poses(reader: Any, topic: str, frame: str) -> Iterator[list[float]]:
@@ -153,8 +164,12 @@ def _poses(reader: Any, topic: str, frame: str) -> Iterator[list[float]]:
             pose = one
             for part in POSES.get(connection.msgtype, "transform").split("."):
                 pose = getattr(pose, part)
-            place = pose.translation if hasattr(pose, "translation") else pose.position
-            turn = pose.rotation if hasattr(pose, "rotation") else pose.orientation
             stamp = one.header.stamp
-            time = float(stamp.sec * 1_000_000_000 + stamp.nanosec)
-            yield [time, place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z]
+            yield [float(stamp.sec * 1_000_000_000 + stamp.nanosec), *_pose(pose)]
+
+
+def _pose(message: Any) -> list[float]:
+    """Return position [m] and quat_wxyz of a pose or a transform."""
+    place = message.translation if hasattr(message, "translation") else message.position
+    turn = message.rotation if hasattr(message, "rotation") else message.orientation
+    return [place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,14 @@ def read_tensor(file: Path, columns: int, *, batched: bool = False) -> NDArray[n
             "a tensor alone, as torch.save writes it; objects of Python are refused: reading them could run code.",
             "take the original, or save the tensor alone.",
         ) from None
+    _require_tensor(file, tensor, columns, batched)
+    return tensor.reshape(-1, columns).numpy().astype(np.float64)
+
+
+def _require_tensor(file: Path, tensor: Any, columns: int, batched: bool) -> None:
+    """Refuse what is no tensor of real numbers in so many columns."""
+    import torch
+
     dimensions = (2, 3) if batched else (2,)
     if not isinstance(tensor, torch.Tensor) or tensor.shape[-1:] != (columns,) or tensor.dim() not in dimensions:
         shape = tuple(tensor.shape) if isinstance(tensor, torch.Tensor) else type(tensor).__name__
@@ -49,4 +58,3 @@ def read_tensor(file: Path, columns: int, *, batched: bool = False) -> NDArray[n
             f"at most {MOST_NUMBERS} real numbers.",
             todo="save each toss as one tensor of real numbers with torch.save.",
         )
-    return tensor.reshape(-1, columns).numpy().astype(np.float64)
