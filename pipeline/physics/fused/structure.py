@@ -232,7 +232,7 @@ class Structure:
         number = 4 if self.single else 8
         size, pairs = number * (2 if self.dual else 1), max(1, len(self.pairs))
         contact = size * (16 + (self.law_count > 1)) + 16
-        parting = 8 + 4 * number + 12 * size + 2 * 132 + 32 * 14 * size
+        parting = 16 + 4 * number + 12 * size + 2 * 132 + 32 * (14 * size + 4 * number + 16)
         shown = max(self.lanes // WARP * parting, 10 * size * self.crowd)
         listed = self.crowd * (contact + size + 4 + 4 + (size if self.areas else 0)) + shown
         bodies = moved * (12 * size + 8) + 4 * len(self.free)
@@ -418,7 +418,7 @@ def _tree_flags(tree: Tree) -> dict[str, int]:
     return {
         "LINKS": len(tree.bodies), "JOINTS": len(tree.joint_dofs), "DOFS": len(tree.dof_above),
         "CHAINS": len(tree.roots), "DEPTH": tree.depth, "HEAVY": tree.heavy, "LEVELS": tree.levels,
-        "BRANCH_COUNT": len(tree.branches), "COLUMNS": tree.columns,
+        "BRANCH_COUNT": len(tree.branches), "SERIAL": tree.serial, "COLUMNS": tree.columns,
         "FIRST_MOVED": int(bool(tree.kinds) and tree.kinds[0] != FREE_ROOT),
     }  # fmt: skip
 

@@ -91,6 +91,15 @@ class Tree:
             found.setdefault(self.dof_above[dof][0], []).append(joint)
         return list(found.values())
 
+    @property
+    def serial(self) -> bool:
+        """Whether each branch is one joint after the other, all of them at one coordinate each."""
+        return all(
+            self.dof_above[self.joint_dofs[joint]] == tuple(self.joint_dofs[each] for each in branch[: place + 1])
+            for branch in self.branches
+            for place, joint in enumerate(branch)
+        )
+
     def groups(self, free: Sequence[bool]) -> list[int]:
         """Return for each body the one under which its contacts count, -1 where it cannot move.
 

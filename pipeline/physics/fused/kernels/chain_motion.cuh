@@ -7,7 +7,7 @@ INLINE Vec rotated(Quat q, Vec v) {
 }
 
 // Poses of the links of all chains from those of the roots and the joints' values.
-CALLED void place_links(const Chain& chain, const Lanes& lanes, const Real* values, Vec* positions, Quat* quats) {
+INLINE void place_links(const Chain& chain, const Lanes& lanes, const Real* values, Vec* positions, Quat* quats) {
     MOVED_LINKS(lanes, l) {  // each in its parent's frame
         int kind = link_kind[l];
         if (link_parent[l] < 0) continue;
@@ -27,7 +27,7 @@ CALLED void place_links(const Chain& chain, const Lanes& lanes, const Real* valu
 }
 
 // Velocities of the links from those of the roots and the joints' speeds.
-CALLED void move_links(const Lanes& lanes, const Vec* axes, const Vec* positions, const Real* speeds, Vec* linear,
+INLINE void move_links(const Lanes& lanes, const Vec* axes, const Vec* positions, const Real* speeds, Vec* linear,
                        Vec* angular) {
     DOWN_LINKS(lanes, l) {
         int parent = link_parent[l], kind = link_kind[l];
@@ -50,7 +50,7 @@ INLINE Spatial column_of(const Configuration& at, int dof) {
     return k < 3 ? linear : angular;
 }
 
-CALLED void configure(const Chain& chain, const Lanes& lanes, const Vec* positions, const Quat* quats,
+INLINE void configure(const Chain& chain, const Lanes& lanes, const Vec* positions, const Quat* quats,
                       Configuration& at) {
     MOVED_LINKS(lanes, l) {
         const Joint j = chain.joints[l];
@@ -78,7 +78,7 @@ INLINE Spatial momentum(const Configuration& at, int l, const Spatial& motion) {
 
 // Adds the mass matrix to A, by composite bodies: mass, first moment and inertia of each link and all that it carries,
 // about the root's origin.
-CALLED void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, Real* A) {
+INLINE void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, Real* A) {
     ROOM(Real, mass, LINKS, chain.room.kick.mass);
     ROOM(Vec, moment, LINKS, chain.room.kick.mass);
     ROOM(Sym, inertia, LINKS, chain.room.kick.mass);
@@ -138,7 +138,7 @@ INLINE Spatial pushed(const Wrenches& w, const Configuration& at, int l, const S
 
 // Forces that keep the generalised velocity: Coriolis, centrifugal, against gravity, and against effects; recursive
 // Newton-Euler.
-CALLED void bias_of(Environment& env, const Lanes& lanes, const Configuration& at, const Vec* root_linear,
+INLINE void bias_of(Environment& env, const Lanes& lanes, const Configuration& at, const Vec* root_linear,
                     const Vec* root_angular, const Vec* root_lift, const Vec* root_twist, const Real* speed, Real* bias) {
     Chain& chain = env.chain;
     ROOM(Spatial, velocity, LINKS, chain.room.kick.force);
@@ -205,7 +205,7 @@ CALLED void bias_of(Environment& env, const Lanes& lanes, const Configuration& a
 // Replaces A, given by rows of each coordinate and those above it, by the rows of the inverse of L, A = L^T L; L has the
 // pattern of A (Featherstone, "Efficient factorization of the joint-space inertia matrix for branched kinematic trees",
 // 2005).
-CALLED void factor(const Lanes& lanes, Real* A) {
+INLINE void factor(const Lanes& lanes, Real* A) {
     UP_DOFS(lanes, d) {
         int last = dof_depth[d] - 1;
         Real* row = A + d * DEPTH;
@@ -229,7 +229,7 @@ CALLED void factor(const Lanes& lanes, Real* A) {
 }
 
 // x = inverse(A) b
-CALLED void solve_mass(Chain& chain, const Lanes& lanes, const Real* b, Real* x) {
+INLINE void solve_mass(Chain& chain, const Lanes& lanes, const Real* b, Real* x) {
     const Real* inverse = chain.inverse;
     ROOM(Real, y, DOFS, chain.room.kick);
     DIVIDED(lanes, d, DOFS) {
@@ -289,7 +289,7 @@ INLINE void carry(const Chain& chain, int l, Vec linear, Vec angular, Motion& mo
 
 // Generalised velocity of the chains after the forces of a step, without contact, and the roots of A; then the
 // velocities of the links at their poses of the start.
-CALLED void kick(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after, const Mat* rotations,
+INLINE void kick(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after, const Mat* rotations,
                  Motion* motions) {
     Chain& chain = env.chain;
     Real h = env.laws[0].step_s, half_h = Number(0.5) * h;
@@ -467,7 +467,7 @@ INLINE Real joint_impulse(const Chain& chain, int j) {
 
 #if SHARED
 // Makes the columns of all links that contact may move, at the pose of the start of the step.
-CALLED void reveal_links(Chain& chain, const Lanes& lanes, const Body* bodies) {
+INLINE void reveal_links(Chain& chain, const Lanes& lanes, const Body* bodies) {
     DIVIDED(lanes, column, COLUMNS) {
         const int l = column_link[column], k = column - column_start[l], depth = link_depth[l];
         if (!chain.known[l]) continue;
@@ -491,10 +491,41 @@ INLINE Real dof_impulse(const Chain& chain, int d) {
     return j < 0 ? Real(0) : joint_impulse(chain, j);
 }
 
+#if GATHERED
+INLINE Number of_other(Number mine, int apart) { return __shfl_xor_sync(FULL, mine, apart, WARP); }
+#if DUAL
+INLINE Real of_other(Real mine, int apart) {
+    return Real(of_other(mine.value, apart), of_other(mine.tangent, apart));
+}
+#endif
+const int SHARERS = 16;  // lanes that sum up one coordinate
+#endif
+
 // Mass-weighted motion of the chains under the impulses of their joints and on their links; each coordinate is summed
-// up by one lane.
-CALLED void push_chains(Chain& chain, const Lanes& lanes) {
+// up by one lane, or by some where few links are touched and many moved.
+INLINE void push_chains(Chain& chain, const Lanes& lanes) {
     const CollideRoom& room = chain.room.collide;
+#if GATHERED
+    const int parts = (DOFS * SHARERS + WARP - 1) / WARP * WARP;  // whole warps
+    KEEP_LOOP
+    for (int part = lanes.lane; part < parts; part += LANES) {
+        const int d = part / SHARERS < DOFS ? part / SHARERS : DOFS - 1, share = part % SHARERS, last = dof_depth[d] - 1;
+        Real sum = Real(0);
+        const int joints = chain.active ? 1 + below_start[d + 1] - below_start[d] : 0;
+        INNER for (int i = share; i < joints; i += SHARERS) {
+            const int from = i == 0 ? d : dof_below[below_start[d] + i - 1];
+            sum += chain.inverse[from * DEPTH + last] * dof_impulse(chain, from);
+        }
+        INNER for (int r = share; r < room.reached_count; r += SHARERS) {
+            const int l = room.reached[r];
+            if (l >= LINKS || link_depth[l] <= last || link_above[l * DEPTH + last] != d) continue;
+            const Column& column = room.columns[column_start[l] + last];
+            sum += dot(column.linear, room.pushes[l]) + dot(column.turning, room.moments[l]);
+        }
+        for (int apart = SHARERS / 2; apart > 0; apart /= 2) sum += of_other(sum, apart);
+        if (share == 0 && part / SHARERS < DOFS) chain.moved[d] = sum;
+    }
+#else
     DIVIDED(lanes, d, DOFS) {
         const int last = dof_depth[d] - 1;
         Real sum = chain.active ? chain.inverse[d * DEPTH + last] * dof_impulse(chain, d) : Real(0);
@@ -503,20 +534,15 @@ CALLED void push_chains(Chain& chain, const Lanes& lanes) {
                 sum += chain.inverse[dof_below[i] * DEPTH + last] * dof_impulse(chain, dof_below[i]);
             }
         }
-#if GATHERED  // few links are touched, and many moved
-        INNER for (int r = 0; r < room.reached_count; r++) {
-            const int l = room.reached[r];
-            if (l >= LINKS || link_depth[l] <= last || link_above[l * DEPTH + last] != d) continue;
-#else
         INNER for (int i = moved_start[d]; i < moved_start[d + 1]; i++) {
             const int l = moved_link[i];
             if (!chain.known[l]) continue;
-#endif
             const Column& column = room.columns[column_start[l] + last];
             sum += dot(column.linear, room.pushes[l]) + dot(column.turning, room.moments[l]);
         }
         chain.moved[d] = sum;
     }
+#endif
     lanes.sync();
 }
 #else
@@ -570,28 +596,61 @@ INLINE void push_joints(Chain& chain) {
 }
 #endif
 
+// Changes the impulses of a joint by one iteration at its present speed; returns the sum of the changes.
+INLINE Real sweep_joint(Chain& chain, int j, Real speed) {
+    const Real mobility = chain.mobility[j], mass = chain.masses[j];
+    Real* old = chain.impulses + 3 * j;
+    Real below = at_least(old[0] + mass * (chain.lower[j] - speed), Number(0));
+    speed += (below - old[0]) * mobility;
+    Real above = at_least(old[1] + mass * (chain.upper[j] + speed), Number(0));
+    speed -= (above - old[1]) * mobility;
+    Real rubbed = old[2] - mass * speed, most = chain.most[j];
+    if (plain(rubbed) > plain(most)) rubbed = most;
+    if (plain(rubbed) < -plain(most)) rubbed = -most;
+    Real change = (below - old[0]) - (above - old[1]) + (rubbed - old[2]);
+    old[0] = below;
+    old[1] = above;
+    old[2] = rubbed;
+    return change;
+}
+
 // One pass over the limits and the dry friction of the joints, one after another in each branch.
-CALLED void sweep_joints(Chain& chain, const Lanes& lanes) {
+#if GATHERED && SERIAL  // each coordinate of a branch is moved by all before it: they stay in registers
+INLINE void sweep_joints(Chain& chain, const Lanes& lanes) {
+    DIVIDED(lanes, branch, BRANCH_COUNT) {
+        const int first = branch_start[branch], count = branch_start[branch + 1] - first;
+        Real moved[DEPTH];
+        SPREAD for (int k = 0; k < DEPTH; k++) {
+            moved[k] = k < count ? chain.moved[joint_dof[branch_joint[first + k]]] : Real(0);
+        }
+        SPREAD for (int k = 0; k < DEPTH; k++) {
+            if (k >= count) continue;
+            const int j = branch_joint[first + k], d = joint_dof[j];
+            if (!chain.busy[j]) continue;
+            Real row[DEPTH], speed = chain.speed[d];
+            SPREAD for (int i = 0; i <= k; i++) row[i] = chain.inverse[d * DEPTH + i];
+            SPREAD for (int i = 0; i <= k; i++) speed += row[i] * moved[i];
+            const Real change = sweep_joint(chain, j, speed);
+            SPREAD for (int i = 0; i <= k; i++) moved[i] += change * row[i];
+        }
+        SPREAD for (int k = 0; k < DEPTH; k++) {
+            if (k < count) chain.moved[joint_dof[branch_joint[first + k]]] = moved[k];
+        }
+    }
+}
+#else
+INLINE void sweep_joints(Chain& chain, const Lanes& lanes) {
     BRANCHES(lanes, j) {
         if (!chain.busy[j]) continue;
         int d = joint_dof[j], depth = dof_depth[d];
         const Real* row = chain.inverse + d * DEPTH;
-        Real speed = chain.speed[d], mobility = chain.mobility[j], mass = chain.masses[j], *old = chain.impulses + 3 * j;
+        Real speed = chain.speed[d];
         EACH_ABOVE(k, depth) speed += row[k] * chain.moved[dof_above[d * DEPTH + k]];
-        Real below = at_least(old[0] + mass * (chain.lower[j] - speed), Number(0));
-        speed += (below - old[0]) * mobility;
-        Real above = at_least(old[1] + mass * (chain.upper[j] + speed), Number(0));
-        speed -= (above - old[1]) * mobility;
-        Real rubbed = old[2] - mass * speed, most = chain.most[j];
-        if (plain(rubbed) > plain(most)) rubbed = most;
-        if (plain(rubbed) < -plain(most)) rubbed = -most;
-        Real change = (below - old[0]) - (above - old[1]) + (rubbed - old[2]);
-        old[0] = below;
-        old[1] = above;
-        old[2] = rubbed;
+        const Real change = sweep_joint(chain, j, speed);
         EACH_ABOVE(k, depth) chain.moved[dof_above[d * DEPTH + k]] += change * row[k];
     }
 }
+#endif
 
 // Velocities that a link gains by the mass-weighted motion of its chain.
 INLINE void gain(const Chain& chain, int l, Vec& linear, Vec& angular) {
@@ -608,7 +667,7 @@ INLINE void gain(const Chain& chain, int l, Vec& linear, Vec& angular) {
 }
 
 // Moves the links to where the roots and the joints put them, with their velocities.
-CALLED void spread(Environment& env, const Lanes& lanes) {
+INLINE void spread(Environment& env, const Lanes& lanes) {
     Chain& chain = env.chain;
     ROOM(Vec, positions, LINKS, chain.room.settle.place);
     ROOM(Vec, linear, LINKS, chain.room.settle.place);
@@ -639,7 +698,7 @@ CALLED void spread(Environment& env, const Lanes& lanes) {
 }
 
 // Moves the chains to the end of the step, in which impulses changed their motion.
-CALLED void settle(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after) {
+INLINE void settle(const Problem& problem, Environment& env, const Lanes& lanes, Real time_after) {
     Chain& chain = env.chain;
     Real h = env.laws[0].step_s, half_h = Number(0.5) * h;
     ROOM(Real, first, DOFS, chain.room.settle);

@@ -319,7 +319,7 @@ __device__ bool part(const Problem& problem, const Environment& env, int p, cons
     found.shift = transposed(R, env.bodies[b].position - Q * env.constants[b].com - env.bodies[a].position);
     found.shift = found.shift + env.constants[a].com;
     find_near(env, a, b, hull_a, hull_b, limit + Number(SMOOTHING_M), found);
-#if NOTED
+#if MARKED
     for (int n = 0; n < found.near_b.count; n++) found.placed_b[n] = edge_in(found, hull_b, found.near_b.edge(n));
     found.met_count = 0;
     found.marks = 0;
@@ -369,7 +369,9 @@ __device__ bool face_edges(const Problem& problem, const Environment& env, int p
     int a = pair_a(p);
 #if NOTED
     const bool listed = parting.met_count >= 0;
+#if MARKED
     if (parting.never(slot)) return false;
+#endif
 #else
     const bool listed = false;
 #endif

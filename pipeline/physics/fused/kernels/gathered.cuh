@@ -21,7 +21,7 @@ INLINE void greatest_of_warp(Number& most, int& index) {
 }
 
 // As `gap_along`, by a warp.
-CALLED Number gap_along_by_warp(const Problem& problem, const Environment& env, int lane, int a, int b,
+INLINE Number gap_along_by_warp(const Problem& problem, const Environment& env, int lane, int a, int b,
                                 const Mat* rotations, const Number* axis) {
     Vec n = vec(Real(axis[0]), Real(axis[1]), Real(axis[2]));
     Number ends[2];
@@ -43,7 +43,7 @@ CALLED Number gap_along_by_warp(const Problem& problem, const Environment& env, 
 }
 
 // As `part_by`, by a warp: each lane takes every WARP-th face.
-CALLED void part_by_warp(const Problem& problem, const Environment& env, int lane, int b, int other,
+INLINE void part_by_warp(const Problem& problem, const Environment& env, int lane, int b, int other,
                          const Mat* rotations, Number sign, Number& most, Number* axis) {
     Hull hull = hull_of(problem, env, b), its = hull_of(problem, env, other);
     Vec origin = env.bodies[other].position - rotations[other] * env.constants[other].com - env.bodies[b].position;
@@ -73,7 +73,7 @@ CALLED void part_by_warp(const Problem& problem, const Environment& env, int lan
 }
 
 // As `flat_face`, by a warp.
-CALLED int flat_face_by_warp(const Problem& problem, const Environment& env, int lane, int b, const Mat& rotation,
+INLINE int flat_face_by_warp(const Problem& problem, const Environment& env, int lane, int b, const Mat& rotation,
                              Number sign, const Number* axis) {
     Hull hull = hull_of(problem, env, b);
     Vec at = transposed(rotation, vec(Real(sign * axis[0]), Real(sign * axis[1]), Real(sign * axis[2])));
@@ -103,7 +103,7 @@ INLINE void list_by_warp(T* listed, int most, int lane, int& count, bool mine, i
 }
 
 // As `find_near`, by a warp.
-CALLED void find_near_by_warp(const Environment& env, int lane, int a, int b, const Hull& hull_a, const Hull& hull_b,
+INLINE void find_near_by_warp(const Environment& env, int lane, int a, int b, const Hull& hull_a, const Hull& hull_b,
                               Number margin, Parting& found) {
     int near_a = 0, near_b = 0;
     INNER for (int from = 0; from < hull_a.ridges; from += WARP) {
@@ -137,7 +137,7 @@ CALLED void find_near_by_warp(const Environment& env, int lane, int a, int b, co
 }
 
 // As `part`, by a warp: `found` is what its lanes have in common.
-CALLED bool part_by_warp(const Problem& problem, const Environment& env, int lane, int p, const Mat* rotations,
+__device__ bool part_by_warp(const Problem& problem, const Environment& env, int lane, int p, const Mat* rotations,
                              Number limit, Parting& found) {
     const int a = pair_a(p), b = pair_b(p);
     Number gap = Number(-1e30), axis[3] = {Number(0), Number(0), Number(1)};
@@ -153,6 +153,7 @@ CALLED bool part_by_warp(const Problem& problem, const Environment& env, int lan
     const bool edges = compared && contact_count(p) > sphere_count(a) + sphere_count(b) && !(gap > limit);
     const Hull hull_a = hull_of(problem, env, a), hull_b = hull_of(problem, env, b);
     __syncwarp(FULL);
+    if (lane == 0) found.met_count = 0;
     if (edges && lane == 0) {
         const Mat &R = rotations[a], &Q = rotations[b];
         Mat turn = {R.x.x * Q.x + R.y.x * Q.y + R.z.x * Q.z, R.x.y * Q.x + R.y.y * Q.y + R.z.y * Q.z,
@@ -172,7 +173,10 @@ CALLED bool part_by_warp(const Problem& problem, const Environment& env, int lan
             KEEP_LOOP
             for (int n = 0; n < many_b; n++) {
                 Crossing crossing;
-                if (!cross_edges(first, near_edge(found, hull_b, n), crossing)) continue;
+                const Edge second = near_edge(found, hull_b, n);
+                if (surely_lean(first, second, Number(OUT_OF_FACE)) || !cross_edges(first, second, crossing)) continue;
+                if (crossing.lean > Number(OUT_OF_FACE)) continue;
+                if (crossing.within && plain(crossing.gap) < limit) found.meet(found.near_a.edge(m), n, crossing);
                 if (crossing.lean > Number(0) || !(plain(crossing.gap) > most)) continue;
                 most = plain(crossing.gap);
                 which = n * many_a + m;
@@ -195,7 +199,9 @@ CALLED bool part_by_warp(const Problem& problem, const Environment& env, int lan
             gap = greater(gap, exact);
         }
     }
+    __syncwarp(FULL);
     if (lane == 0) {
+        if (found.met_count > MET_ROOM) found.met_count = -1;
         found.on_a = on_a;
         found.on_b = on_b;
         found.gap = gap;
@@ -226,8 +232,11 @@ INLINE void gather(Environment& env, const Contact& c, Real weight, int p) {
     room.pairs[place] = p;
 }
 
+// The slot of two edges, among those of edges.
+INLINE int slot_of(const Met& met) { return 2 * met.edge + met.leaves; }
+
 // Makes the contact of slot `k` of two bodies, if they touch there.
-CALLED void touch_slot(const Problem& problem, Environment& env, int p, int k, const Mat* rotations,
+__device__ void touch_slot(const Problem& problem, Environment& env, int p, int k, const Mat* rotations,
                            const Motion* motions, const Parting& parting, int edge) {
     CollideRoom& room = env.chain.room.collide;
     Contact c;
@@ -239,7 +248,7 @@ CALLED void touch_slot(const Problem& problem, Environment& env, int p, int k, c
 }
 
 // The edge of a hull that is nearest to the point of one lane.
-CALLED int nearest_edge_by_warp(const Hull& hull, int lane, int whose, const Number* point) {
+INLINE int nearest_edge_by_warp(const Hull& hull, int lane, int whose, const Number* point) {
     Number p[3], nearest = Number(-1e30);
     for (int k = 0; k < 3; k++) p[k] = __shfl_sync(FULL, point[k], whose, WARP);
     int edge = hull.edges;
@@ -254,7 +263,7 @@ CALLED int nearest_edge_by_warp(const Hull& hull, int lane, int whose, const Num
 }
 
 // Finds the contacts of two bodies, by a warp.
-CALLED void touch_pair(const Problem& problem, Environment& env, const Lanes& lanes, int p, const Mat* rotations,
+INLINE void touch_pair(const Problem& problem, Environment& env, const Lanes& lanes, int p, const Mat* rotations,
                        const Motion* motions) {
     const int a = pair_a(p), b = pair_b(p), lane = lane_of_warp(lanes);
     CollideRoom& room = env.chain.room.collide;
@@ -302,11 +311,16 @@ CALLED void touch_pair(const Problem& problem, Environment& env, const Lanes& la
         }
         if (mine) touch_slot(problem, env, p, k, rotations, motions, parting, edge);
     }
-    // of edges, only those that are near have contacts
-    const int slots = contact_count(p) - spheres_in_all;
+    // of edges, those that met have contacts, or, where these are more than there is room for, those that are near
+    const int slots = contact_count(p) - spheres_in_all, met = parting.met_count;
+    const int many = slots == 0 ? 0 : met >= 0 ? met : 2 * parting.near_a.many(slots / 2);
     KEEP_LOOP
-    for (int i = lane; slots > 0 && i < 2 * parting.near_a.many(slots / 2); i += WARP) {
-        touch_slot(problem, env, p, spheres_in_all + 2 * parting.near_a.edge(i / 2) + i % 2, rotations, motions, parting, -1);
+    for (int i = lane; i < many; i += WARP) {
+        int slot = met >= 0 ? slot_of(parting.met[i]) : 2 * parting.near_a.edge(i / 2) + i % 2;
+        for (int before = 0; before < (met >= 0 ? i : 0); before++) {
+            if (slot_of(parting.met[before]) == slot) slot = -1;
+        }
+        if (slot >= 0) touch_slot(problem, env, p, spheres_in_all + slot, rotations, motions, parting, -1);
     }
     __syncwarp(FULL);  // before the next pair overwrites how these two part
 }
@@ -357,7 +371,7 @@ INLINE void touch_plane(const Problem& problem, Environment& env, const Lanes& l
 }
 
 // Finds the contacts of all pairs that may touch. Returns their number; `order` then has them by pair and number.
-CALLED int gather_all(const Problem& problem, Environment& env, const Lanes& lanes, const Mat* rotations,
+INLINE int gather_all(const Problem& problem, Environment& env, const Lanes& lanes, const Mat* rotations,
                       const Motion* motions) {
     CollideRoom& room = env.chain.room.collide;
     if (lanes.lane < WARP) {
@@ -400,7 +414,7 @@ CALLED int gather_all(const Problem& problem, Environment& env, const Lanes& lan
 }
 
 // Distributes the effective mass among the contacts of each pair.
-CALLED void share_out_pairs(Environment& env, const Lanes& lanes, int count) {
+INLINE void share_out_pairs(Environment& env, const Lanes& lanes, int count) {
     CollideRoom& room = env.chain.room.collide;
     DIVIDED(lanes, r, count) {
         const int i = room.order[r];
@@ -478,7 +492,7 @@ INLINE void list_reached_by_warp(Environment& env, const Lanes& lanes) {
 }
 
 // Lists the contacts of each body that they may move.
-CALLED void list_acting(Environment& env, const Lanes& lanes, int count) {
+INLINE void list_acting(Environment& env, const Lanes& lanes, int count) {
     CollideRoom& room = env.chain.room.collide;
     DIVIDED(lanes, r, room.reached_count) {
         const int body = body_at(room.reached[r]);
@@ -503,7 +517,7 @@ CALLED void list_acting(Environment& env, const Lanes& lanes, int count) {
 }
 
 // As `sweep_contacts`; each number of the sum of a body is made by one lane.
-CALLED void sweep_gathered(Environment& env, const Lanes& lanes, int count, const Motion* motions, bool changes) {
+INLINE void sweep_gathered(Environment& env, const Lanes& lanes, int count, const Motion* motions, bool changes) {
     CollideRoom& room = env.chain.room.collide;
     DIVIDED(lanes, r, count) {
         Contact& c = room.list[room.order[r]];
@@ -529,7 +543,7 @@ CALLED void sweep_gathered(Environment& env, const Lanes& lanes, int count, cons
 }
 
 // As `keep`, and notes the impulses of labels.
-CALLED void keep_gathered(const Problem& problem, Environment& env, Own& own, int count) {
+INLINE void keep_gathered(const Problem& problem, Environment& env, Own& own, int count) {
     const CollideRoom& room = env.chain.room.collide;
     DIVIDED(own.lanes, r, count) {
         const Contact& c = room.list[room.order[r]];

@@ -94,9 +94,9 @@ INLINE Edge placed_edge(const Edge& edge, const Mat& rotation, Vec origin) {
 }
 
 // Whether two edges lean by more than a bound, up to rounding, without the root that their normal needs: most do. Threads
-// of a warp would wait for those that do not.
+// of a warp that compare other bodies would wait for those that do not.
 INLINE bool surely_lean(const Edge& first, const Edge& second, Number bound) {
-#if !HOST
+#if !HOST && !GATHERED
     return false;
 #else
     const Vec over = cross(first.along, second.along);

@@ -32,13 +32,6 @@
 #endif
 #define KEEP_LOOP _Pragma("unroll 1")
 #endif
-// A function that is called and not copied, where one thread after the other waits for the instructions of a step, most of
-// which run once in it: there is more of them than the cache of instructions holds.
-#if GATHERED && !HOST
-#define CALLED __device__ __noinline__
-#else
-#define CALLED INLINE
-#endif
 // What the lanes of an environment have in common. Where there is one copy for all of them (SHARED), each does every
 // LANES-th part of the work, and waits for the others (`Lanes::sync`) before it reads what they wrote. Otherwise each
 // has a copy of its own and does everything. ROOM names an array: in the one copy, or of this lane.

@@ -16,16 +16,17 @@ struct Crossing {  // the common normal of two edges, out of the first body
     bool leaves;  // whether the first edge, from its first to its second end, leaves the other body
 };
 
-#define NOTED (HOST && !GATHERED)  // whether edges that may be a contact are kept, in lists of more room
-const int NEAR_ROOM = NOTED ? 64 : 32;
+#define MARKED (HOST && !GATHERED)  // whether lists of edges have marks, and more room
+#define NOTED (HOST || GATHERED)    // whether edges that may be a contact are kept
+const int NEAR_ROOM = MARKED ? 64 : 32;
 struct Near {  // edges of a hull that are near another one; all of them where more are than there is room for
     int count, listed[NEAR_ROOM];
-#if NOTED
+#if MARKED
     unsigned long long marks;  // of the listed edges by their number modulo 64
 #endif
     INLINE void clear() {
         count = 0;
-#if NOTED
+#if MARKED
         marks = 0;
 #endif
     }
@@ -34,12 +35,12 @@ struct Near {  // edges of a hull that are near another one; all of them where m
     INLINE void add(int edge) {
         if (count == NEAR_ROOM) count = -1;
         if (count >= 0) listed[count++] = edge;
-#if NOTED
+#if MARKED
         marks |= 1ULL << (edge & 63);
 #endif
     }
     INLINE bool has(int edge) const {
-#if NOTED
+#if MARKED
         if (count >= 0 && !(marks >> (edge & 63) & 1)) return false;
 #endif
         bool found = count < 0;
@@ -49,7 +50,7 @@ struct Near {  // edges of a hull that are near another one; all of them where m
 };
 
 #if NOTED
-const int MET_ROOM = 64;
+const int MET_ROOM = MARKED ? 64 : 32;
 struct Met {  // edges of two hulls that may be a contact, without derivatives
     int edge, other;  // of a, and the number of the near edge of b
     bool leaves;      // as `edge_leaves`
@@ -68,15 +69,24 @@ struct Parting {  // how two hulls part best
     Edge placed_b[NEAR_ROOM];  // the near edges of b in the frame of a, where there is room for them
 #endif
 #if NOTED
-    Met met[MET_ROOM];         // sorted by the near edge of b
-    int met_count;             // -1: there are more than there is room for
+    Met met[MET_ROOM];  // on a CPU sorted by the near edge of b
+    int met_count;      // -1: there are more than there is room for
+#if MARKED
     unsigned long long marks;  // of their edges of a by the number modulo 64
     // Whether a slot of edges has surely no contact.
     INLINE bool never(int slot) const { return met_count >= 0 && !(marks >> (slot / 2 & 63) & 1); }
+#endif
     INLINE void meet(int edge, int other, const Crossing& crossing) {
+#if MARKED
         if (met_count == MET_ROOM) met_count = -1;
         if (met_count < 0) return;
-        Met& one = met[met_count++];
+        const int place = met_count++;
+        marks |= 1ULL << (edge & 63);
+#else
+        const int place = Lanes::count_up(met_count);
+        if (place >= MET_ROOM) return;
+#endif
+        Met& one = met[place];
         one.edge = edge;
         one.other = other;
         one.leaves = crossing.leaves;
@@ -84,7 +94,6 @@ struct Parting {  // how two hulls part best
         one.normal[0] = plain(crossing.normal.x);
         one.normal[1] = plain(crossing.normal.y);
         one.normal[2] = plain(crossing.normal.z);
-        marks |= 1ULL << (edge & 63);
     }
 #endif
 };

@@ -163,6 +163,27 @@ INLINE void move_bodies(Environment& env, const Lanes& lanes, Motion* motions, V
     push_chains(chain, lanes);
     if (joints && chain.active) sweep_joints(chain, lanes);
     lanes.sync();
+#if GATHERED  // each number by one lane
+    DIVIDED(lanes, part, 6 * room.reached_count) {
+        const int place = room.reached[part / 6], k = part % 6, axis = k < 3 ? k : k - 3;
+        const Velocities& free = room.free[place];
+        Real sum = (&(k < 3 ? free.velocity : free.omega).x)[axis];
+        if (place < LINKS) {
+            const Column* columns = room.columns + column_start[place];
+            EACH_ABOVE(i, link_depth[place]) {
+                const Real moved = chain.moved[link_above[place * DEPTH + i]];
+                sum = sum + moved * (&(k < 3 ? columns[i].linear : columns[i].turning).x)[axis];
+            }
+        } else {
+            const int f = place - LINKS;
+            const Vec gained = k < 3 ? chain.free_masses[f] * room.pushes[place] : chain.free_inertias[f] * room.moments[place];
+            sum = sum + (&gained.x)[axis];
+            if (last && k >= 3) (&spins[f].x)[axis] = (&spins[f].x)[axis] + (&room.moments[place].x)[axis];
+        }
+        Velocities& m = motions[body_at(place)];
+        (&(k < 3 ? m.velocity : m.omega).x)[axis] = sum;
+    }
+#else
     DIVIDED(lanes, r, room.reached_count) {
         const int place = room.reached[r];
         Velocities m = room.free[place];
@@ -176,6 +197,7 @@ INLINE void move_bodies(Environment& env, const Lanes& lanes, Motion* motions, V
         }
         motions[body_at(place)] = m;
     }
+#endif
     lanes.sync();
 }
 #endif
