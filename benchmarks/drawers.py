@@ -1,6 +1,7 @@
 """Numbers of drawers that a finger pushes, drawn by seed: do the intervals of mass, losses and friction hold?
 
     python benchmarks/drawers.py FOLDER [--kind mujoco|rigid|spring] [--seed N] [--path_mm H] [--shape_mm S]
+                                        [--without_forces]
 
 Mass, friction and damping of the rail, frame rate, noise of all that is measured, what the file of the drawer says of
 its mass, the error of the finger's radius and the noise of its path are drawn; `--path_mm` and `--shape_mm` set the
@@ -9,6 +10,9 @@ soft so that it rings. `rigid` and `spring` are simulated here: a drawer that go
 pushed, and one on a spring with a damper; nothing slides along them, so that nothing tells the friction of the finger.
 Forces are samples there, and in MuJoCo means since the sample before. One JSON line for each number: what was true,
 estimate and 95 % interval.
+
+`--without_forces` leaves the forces out of the tracks. Motion then tells losses by mass alone: the true ones are those
+of a drawer that has the mass that the file says.
 """
 
 from __future__ import annotations
@@ -185,7 +189,7 @@ def in_mujoco(setting: Setting, push: Push) -> Motion:
     return at, q, finger, force
 
 
-def track(rng: np.random.Generator, setting: Setting, motion: Motion) -> list[str]:
+def track(rng: np.random.Generator, setting: Setting, motion: Motion, forces: bool) -> list[str]:
     """Return the rows of a track, with noise on what is measured."""
     rows = [COLUMNS + ",force_x_n,force_y_n,force_z_n"]
     for at, q, finger, force in zip(*motion, strict=True):
@@ -200,7 +204,7 @@ def track(rng: np.random.Generator, setting: Setting, motion: Motion) -> list[st
                 [f"{at:.5f},finger", *(f"{v:.6f}" for v in path), "1,0,0,0", *(f"{v:.4f}" for v in exerted)],
             ),
         ]
-    return rows
+    return rows if forces else [row.rsplit(",", 3)[0] for row in rows]
 
 
 def capture(folder: Path, setting: Setting, motions: list[list[str]]) -> Path:
@@ -231,6 +235,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--path_mm", type=float)
     parser.add_argument("--shape_mm", type=float)
+    parser.add_argument("--without_forces", action="store_true")
     given = parser.parse_args()
     rng = np.random.default_rng([given.seed, ("mujoco", "rigid", "spring").index(given.kind)])
     drawn = asdict(Setting.drawn(rng, given.kind))
@@ -238,18 +243,21 @@ def main() -> None:
     drawn |= {} if given.shape_mm is None else {"shape_m": given.shape_mm / 1e3}
     setting = Setting(**drawn)
     simulated = in_mujoco if given.kind == "mujoco" else by_hand
-    motions = [track(rng, setting, simulated(setting, Push.drawn(rng))) for _ in range(setting.pushes)]
+    forces = not given.without_forces
+    motions = [track(rng, setting, simulated(setting, Push.drawn(rng)), forces) for _ in range(setting.pushes)]
     made = capture(given.folder / "drawer", setting, motions)
     print(json.dumps({"seed": given.seed, **drawn}), flush=True)
     began = time.process_time()
     fit(made, given.folder / "model", overwrite=True)
+    factor = setting.mass_kg / setting.stated_kg
+    by_mass = 1.0 if forces else factor
     truth = {
-        "cabinet.mass_factor": setting.mass_kg / setting.stated_kg,
-        "rail.friction": setting.friction_n,
-        "rail.damping": setting.damping_n_s_m,
+        "cabinet.mass_factor": factor,
+        "rail.friction": setting.friction_n / by_mass,
+        "rail.damping": setting.damping_n_s_m / by_mass,
         "friction": setting.mu,
     }
-    more = {"seed": given.seed, "kind": given.kind, "cpu_s": round(time.process_time() - began, 1)}
+    more = {"seed": given.seed, "kind": given.kind, "forces": forces, "cpu_s": round(time.process_time() - began, 1)}
     print_found(given.folder / "model", truth, more)
 
 
