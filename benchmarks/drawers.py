@@ -1,7 +1,7 @@
 """Numbers of drawers that a finger pushes, drawn by seed: do the intervals of mass, losses and friction hold?
 
     python benchmarks/drawers.py FOLDER [--kind mujoco|rigid|spring] [--seed N] [--path_mm H] [--shape_mm S]
-                                        [--without_forces]
+                                        [--without_forces] [--shoves]
 
 Mass, friction and damping of the rail, frame rate, noise of all that is measured, what the file of the drawer says of
 its mass, the error of the finger's radius and the noise of its path are drawn; `--path_mm` and `--shape_mm` set the
@@ -12,7 +12,8 @@ Forces are samples there, and in MuJoCo means since the sample before. One JSON 
 estimate and 95 % interval.
 
 `--without_forces` leaves the forces out of the tracks. Motion then tells losses by mass alone: the true ones are those
-of a drawer that has the mass that the file says.
+of a drawer that has the mass that the file says. With `--shoves` the finger stops at once in the middle of its path, so
+that the drawer glides on.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import argparse
 import json
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -97,6 +98,8 @@ class Push:
     gap_m: float
     aside_m: float
     """Where the finger starts beside the middle of the face."""
+    stops: float = 1.0
+    """Share of the time at which it stops at once."""
 
     @staticmethod
     def drawn(rng: np.random.Generator) -> Push:
@@ -111,11 +114,12 @@ class Push:
 
     def path(self, time_s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return way, speed and acceleration at times: of least jerk (Flash and Hogan, 1985)."""
-        s = np.clip(np.asarray(time_s) / self.time_s, 0.0, 1.0)
+        share = np.asarray(time_s) / self.time_s
+        s, moves = np.clip(share, 0.0, self.stops), share < self.stops
         way = self.length_m * s**3 * (10 - 15 * s + 6 * s**2)
         speed = self.length_m / self.time_s * 30 * s**2 * (1 - s) ** 2
         acceleration = self.length_m / self.time_s**2 * 60 * s * (1 - s) * (1 - 2 * s)
-        return way, speed, acceleration
+        return way, speed * moves, acceleration * moves
 
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -236,6 +240,7 @@ def main() -> None:
     parser.add_argument("--path_mm", type=float)
     parser.add_argument("--shape_mm", type=float)
     parser.add_argument("--without_forces", action="store_true")
+    parser.add_argument("--shoves", action="store_true")
     given = parser.parse_args()
     rng = np.random.default_rng([given.seed, ("mujoco", "rigid", "spring").index(given.kind)])
     drawn = asdict(Setting.drawn(rng, given.kind))
@@ -243,8 +248,9 @@ def main() -> None:
     drawn |= {} if given.shape_mm is None else {"shape_m": given.shape_mm / 1e3}
     setting = Setting(**drawn)
     simulated = in_mujoco if given.kind == "mujoco" else by_hand
-    forces = not given.without_forces
-    motions = [track(rng, setting, simulated(setting, Push.drawn(rng)), forces) for _ in range(setting.pushes)]
+    forces, stops = not given.without_forces, 0.5 if given.shoves else 1.0
+    pushes = (replace(Push.drawn(rng), stops=stops) for _ in range(setting.pushes))
+    motions = [track(rng, setting, simulated(setting, push), forces) for push in pushes]
     made = capture(given.folder / "drawer", setting, motions)
     print(json.dumps({"seed": given.seed, **drawn}), flush=True)
     began = time.process_time()

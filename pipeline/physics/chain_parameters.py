@@ -20,6 +20,8 @@ damping, as a share of that torque at the speed of a swing."""
 LOSS_STD, MASS_STD, INERTIA_STD = 1.5, 0.3, 0.4
 """Standard deviations of the priors' logarithms: of losses in joints, shares of mass, and inertia."""
 GRAVITY_M_S2 = 9.81
+LOSSES = (".damping", ".friction")
+"""Ends of the names of losses in joints."""
 
 
 def chain_parameters(world: World) -> list[Parameter]:
@@ -57,7 +59,7 @@ def _losses(world: World, chain: Chain, joint: Joint) -> list[Parameter]:
             float(given[0]) if float(given[0]) > 0 else LOSS_SHARE * scale,
             LOSS_STD,
             (1e-5 * scale, 10 * scale),
-            f"motion of the joint '{joint.name}' between contacts",
+            f"motion of the joint '{joint.name}' between contacts, as after a shove, or measured forces that push it",
         )
         for name, unit, scale, given in rows
     ]

@@ -72,6 +72,7 @@ from .contact_shooting import ShootingEpisodes, shoot_contact
 from .driven_joints import fit_driven_joints
 from .earlier_estimates import EarlierEstimates
 from .force_fit import with_forces
+from .glides import fit_gliding_joints
 from .inertia_fit import MASS_PARTS, fit_mass_distribution
 from .joint_fit import fit_joints
 from .measured_forces import measured_forces
@@ -155,16 +156,22 @@ def _found(
     if data.airborne:
         return _never_touching(ready, batch, data, record, earlier)
     driven = fit_driven_joints(ready.world, data.searched, data.noise, force_std_n)
+    forces = measured_forces(ready.world, data.searched, batch.observations, force_std_n)
+    gliding = None if forces or driven is not None else fit_gliding_joints(ready.world, data.searched, data.noise)
     known = ready
     if driven is not None:
         known = replace(ready, world=driven.world(ready.world), start=driven.narrowed(ready.start))
+    elif gliding is not None:
+        known = replace(ready, start=gliding.told().narrowed(ready.start))
     estimate, record = _contact_estimate(known, data, batch, config, warm_started, record)
     if data.bounces is not None:
         estimate = with_damping(estimate, damping_of(data.bounces, ready.world, estimate.contact_time_s))
-    forces = measured_forces(ready.world, data.searched, batch.observations, force_std_n)
     if driven is not None:
         estimate = driven.put_in(estimate, ready.parameters)
         record = replace(record, forces=driven.record)
+    elif gliding is not None:
+        estimate = gliding.leave_open(gliding.told().put_in(estimate, ready.parameters))
+        record = replace(record, glides=gliding.record)
     elif forces:
         note("phys-geo: measured forces")
         estimate, told = with_forces(ready.world, estimate, forces, batch.observations, batch.start_cov)

@@ -156,6 +156,8 @@ class FitRecord:
     """Course of multiple shooting, where it was used."""
     forces: dict[str, Any] | None = None
     """Record of the fit to measured forces, where there are any."""
+    glides: dict[str, Any] | None = None
+    """Record of the fit of joints to where nothing touches them, where forces are unknown."""
     images: dict[str, Any] = field(default_factory=dict)
     """Entries of a fit to videos."""
 
@@ -166,6 +168,7 @@ class FitRecord:
             "the mass distribution": (_converged(self.mass_distribution), ""),
             "the effects": (_converged(self.effects), ""),
             "the measured forces": (_converged(self.forces), ""),
+            "the joints to where they glide": (_converged(self.glides), ""),
             "the contact parameters (multiple shooting)": (shot, ", or pass a larger --set phys-geo.iterations"),
         }
         return [
@@ -191,6 +194,7 @@ class FitRecord:
             "search_open_loop_m": self.search_open_loop_m,
             "search_effective_samples": self.search_effective_samples,
             "forces": self.forces,
+            "glides": self.glides,
         }
         record |= {name: value for name, value in optional.items() if value is not None}
         return record | ({} if self.shooting is None else self.shooting.to_json()) | self.images

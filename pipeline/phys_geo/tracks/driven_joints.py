@@ -31,7 +31,7 @@ from torch import Tensor
 
 from ....datasets.capture.tracks import Episode, Track
 from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
-from ...physics.chain_parameters import chain_parameters, mass_factor
+from ...physics.chain_parameters import LOSSES, chain_parameters, mass_factor
 from ...physics.parameters import GAP, Parameter, gap_parameters
 from ...physics.world import World
 from ...trajectories.initial_state import clearance
@@ -97,16 +97,17 @@ def fit_driven_joints(
         noise: Of the tracks (position [m], rotation [rad]).
         force_std_n: Noise of a component of the forces [N]; estimated where None.
     """
-    if not _takes(world):
+    if not takes(world):
         return None
     pushed = [one for one in (_Pushed.of(world, episode, force_std_n) for episode in episodes) if one is not None]
     data = _Data.of(world, pushed, noise) if pushed else None
     return None if data is None else _fitted(data)
 
 
-def _takes(world: World) -> bool:
-    """Return whether a world is one jointed body on a fixed root, beside driven bodies and what does not move."""
+def takes(world: World) -> bool:
+    """Return whether a world is one passive jointed body on a fixed root, beside driven and fixed ones."""
     one = len(world.chains) == 1 and world.chains[0].base == "fixed" and not world.chains[0].touching
+    one = one and not world.chains[0].has_servos
     links = set(world.chains[0].links) if one else set()
     return one and not world.effects and all(world.bodies[k].name in links for k in world.tracked)
 
@@ -203,14 +204,14 @@ class _Data:
         sense, size = _senses(tracks, pushes, grid)
         part, std = _parts(tracks, sense, kicks, variance, size)
         interval = [float(np.median(np.diff(t.time_s))) for one in pushed for n in names if (t := one.force(n))]
-        losses = [p for p in chain_parameters(world) if p.name.endswith((".damping", ".friction"))]
+        losses = [p for p in chain_parameters(world) if p.name.endswith(LOSSES)]
         return _Data(
             pushed=pushed,
             driven=ForceDriven(world=world, chain=chain, root=tracks.root, grid=grid, pushes=pushes, sense=sense),
             tracks=tracks,
             parameters=[*losses, mass_factor(chain)],
-            root=_root(tracks.information),
-            start=_starts(tracks),
+            root=information_root(tracks.information),
+            start=starts(tracks),
             part=part,
             part_std=std,
             late_s=0.5 * float(np.median(interval)),
@@ -396,7 +397,7 @@ def _parts(tracks: JointTracks, sense: Tensor, kicks: Tensor, variance: Tensor, 
     return part, torch.where(whole > 0, std, none).clamp_min(1e-9)
 
 
-def _starts(tracks: JointTracks) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def starts(tracks: JointTracks) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return first guesses of values and speeds, and the standard deviations of their priors, each (E, J)."""
     t = (tracks.times_s - tracks.times_s[:, :1])[:, :FIRST_FRAMES, None]
     first = tracks.values[:, :FIRST_FRAMES]
@@ -408,7 +409,7 @@ def _starts(tracks: JointTracks) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return mean[:, 0] - speed * middle[:, 0], speed, error, error / spread.sqrt()
 
 
-def _root(information: Tensor) -> Tensor:
+def information_root(information: Tensor) -> Tensor:
     """Return the symmetric roots of informations (..., J, J)."""
     values, axes = torch.linalg.eigh(information)
     return (axes * values.clamp_min(0.0).sqrt()[..., None, :]) @ axes.transpose(-1, -2)

@@ -28,8 +28,11 @@ from ....schemas.materials import of_pair
 from ...physics.chain_values import with_chain_values
 from ...physics.parameters import CONTACT_TIME, DAMPING_RATIO, FRICTION, GROUND_SHIFT, Parameter
 from ...physics.world import World
+from ...segments.fitted_parameters import LIMITS
 from .contact_result import ContactEstimate
 
+UNTOLD = LIMITS.unobservable_share
+"""Standard error, as a share of the prior's, from which on a parameter is not observable."""
 Start = tuple[Parameter, float]
 """A parameter of a search, and where it starts."""
 
@@ -77,6 +80,26 @@ class DrivenFit:
     def narrowed(self, start: Sequence[Start]) -> list[Start]:
         """Return the parameters of a search with what is known as their priors, and where it starts."""
         return [self._narrow(*one) for one in start]
+
+    def told(self) -> DrivenFit:
+        """Return the part of the parameters that are observable."""
+        rows = [k for k, p in enumerate(self.parameters) if self.covariance[k, k] < (UNTOLD * p.prior[1]) ** 2]
+        names = [self.parameters[k] for k in rows]
+        return replace(self, parameters=names, values=self.values[rows], covariance=self.covariance[np.ix_(rows, rows)])
+
+    def leave_open(self, estimate: ContactEstimate) -> ContactEstimate:
+        """Return the estimate of a search with the widths of the priors for parameters that are not observable.
+
+        What it says of them rests on how deep bodies press into each other. Values stay, as they go with the others.
+        """
+        known = {p.name for p in self.told().parameters}
+        open_now = {p.name for p in self.parameters} - known
+        covariance = estimate.covariance.copy()
+        for k, parameter in enumerate(estimate.parameters):
+            if parameter.name in open_now:
+                covariance[k], covariance[:, k] = 0.0, 0.0
+                covariance[k, k] = parameter.prior[1] ** 2
+        return replace(estimate, covariance=covariance)
 
     def put_in(self, estimate: ContactEstimate, parameters: Sequence[Parameter]) -> ContactEstimate:
         """Return the estimate of a search with what forces tell in place of what it says of the same numbers.
