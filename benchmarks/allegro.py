@@ -29,9 +29,9 @@ import numpy as np
 import torch
 from allegro_scenes import resized, scene_of
 from cgwm.datasets.models.model import Model
-from cgwm.pipeline.control.hand_controller import HandController
-from cgwm.pipeline.control.hand_loop import run_hand
-from cgwm.pipeline.control.hand_plant import HandScenePlant
+from cgwm.pipeline.control.hand.controller import HandController
+from cgwm.pipeline.control.hand.loop import run_hand
+from cgwm.pipeline.control.hand.plant import HandScenePlant
 from cgwm.pipeline.runtime.resources import no_garbage_search
 from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
 from cgwm.schemas import ContactParameters, HandTask

@@ -3,7 +3,7 @@
 The truth is an integrator of its own: a ball of 40 mm and 2.7 g with quadratic drag and an unknown spin bounces once
 (Routh's impact of a shell, restitution 0.95), with some frames before and after. Measured is the centroid alone, with
 errors of 0.5 mm that are correlated over 5 to 50 ms and white ones of 0.1 mm. For each frame rate: the fit of
-`segments/restitution_fit.py`, as `cgwm fit` calls it, to captures of 24, 4 and 1 bounces, 200 bounces in all.
+`segments/impacts/restitution.py`, as `cgwm fit` calls it, to captures of 24, 4 and 1 bounces, 200 bounces in all.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.physics import Body, ContactLaw, World
-from cgwm.pipeline.segments.restitution_fit import restitution_of
+from cgwm.pipeline.segments.impacts.restitution import restitution_of
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from numpy.typing import NDArray
 

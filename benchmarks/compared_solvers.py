@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from cgwm.pipeline.control.elites import Elites
+from cgwm.pipeline.control.hand.elites import Elites
 from cgwm.pipeline.control.objective import Draw, Objective
 from cgwm.pipeline.control.solvers import Both, GaussNewton, Solution, Solver
 

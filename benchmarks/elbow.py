@@ -32,8 +32,8 @@ from cgwm.datasets import Capture, import_elbow, read_model
 from cgwm.datasets.capture.links import articulations_of
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.datasets.models.model import Model
-from cgwm.pipeline.physics.chain_parameters import chain_parameters
-from cgwm.pipeline.physics.chain_state import joints_of, with_joints
+from cgwm.pipeline.physics.chains.parameters import chain_parameters
+from cgwm.pipeline.physics.chains.state import joints_of, with_joints
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.parameters import GROUND_SHIFT, Parameter
 from cgwm.pipeline.physics.world import State, World

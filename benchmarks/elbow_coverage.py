@@ -26,7 +26,7 @@ from cgwm.datasets import Capture, import_elbow, read_model
 from cgwm.datasets.capture.links import articulations_of
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
-from cgwm.pipeline.physics.chain_parameters import chain_parameters
+from cgwm.pipeline.physics.chains.parameters import chain_parameters
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.parameters import (
     CONTACT_PARAMETERS,

@@ -36,9 +36,9 @@ from typing import Any
 import numpy as np
 import torch
 from cgwm.datasets.models.model import Model, read_model
-from cgwm.pipeline.control.hand_controller import HandController
-from cgwm.pipeline.control.hand_loop import run_hand
-from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
+from cgwm.pipeline.control.hand.controller import HandController
+from cgwm.pipeline.control.hand.loop import run_hand
+from cgwm.pipeline.control.hand.plant import HandScenePlant, HandTruth
 from cgwm.pipeline.control.horizon import Array, Forecast
 from cgwm.pipeline.control.planning import ControlPlan, ControlState, PlanningController
 from cgwm.pipeline.control.solvers import Solution

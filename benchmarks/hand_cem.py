@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from cgwm.datasets.models.model import Model
-from cgwm.pipeline.control.hand_controller import HandController
+from cgwm.pipeline.control.hand.controller import HandController
 from cgwm.pipeline.control.horizon import Array, Forecast, Targets
 from cgwm.pipeline.control.planning import ControlPlan, ControlState
 from cgwm.pipeline.geometry.rotation import quat_turn

@@ -25,14 +25,14 @@ from typing import Any
 import hand
 import numpy as np
 import torch
-from cgwm.pipeline.control.hand_controller import HandController
-from cgwm.pipeline.control.hand_loop import run_hand
-from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
+from cgwm.pipeline.control.hand.controller import HandController
+from cgwm.pipeline.control.hand.loop import run_hand
+from cgwm.pipeline.control.hand.plant import HandScenePlant, HandTruth
 from cgwm.pipeline.control.horizon import Array
 from cgwm.pipeline.geometry.rotation import quat_turn
-from cgwm.pipeline.physics.chain_state import joints_of
+from cgwm.pipeline.physics.chains.joint_command import JointCommand
+from cgwm.pipeline.physics.chains.state import joints_of
 from cgwm.pipeline.physics.engine import rollout
-from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.physics.world import State
 from cgwm.pipeline.sg_gs import link_hulls
 from cgwm.schemas import HandTask

@@ -24,12 +24,12 @@ import numpy as np
 import torch
 from cgwm.datasets.robots import read_articulation
 from cgwm.pipeline.physics import Body, ContactLaw, State, World
-from cgwm.pipeline.physics.articulated import Servo, chain_of
-from cgwm.pipeline.physics.chain_state import with_joints
+from cgwm.pipeline.physics.chains.articulated import Servo, chain_of
+from cgwm.pipeline.physics.chains.joint_command import JointCommand
+from cgwm.pipeline.physics.chains.state import with_joints
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.fused import simulate_fused
-from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.sg_gs.link_spheres import link_spheres
 from numpy.typing import NDArray
 from torch import Tensor

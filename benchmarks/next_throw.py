@@ -32,10 +32,10 @@ from cgwm.datasets.models.model import read_model
 from cgwm.datasets.synthetic.hidden_effects.mechanics import Mechanics, Start, build
 from cgwm.datasets.synthetic.hidden_effects.record import ENGINES, measured
 from cgwm.datasets.synthetic.hidden_effects.things import Kind
-from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.experiments import DEFAULT, experiments_of
-from cgwm.pipeline.diagnose.next_experiment import RankedExperiment, Rivals, ranked_experiments
-from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.diagnose.evidence.evidence import Evidence
+from cgwm.pipeline.diagnose.evidence.score_test import ScoreTest
+from cgwm.pipeline.diagnose.next_experiment.experiments import DEFAULT, experiments_of
+from cgwm.pipeline.diagnose.next_experiment.throws import RankedExperiment, Rivals, ranked_experiments
 from cgwm.pipeline.diagnose.stage import prepared_world
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect

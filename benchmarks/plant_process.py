@@ -15,8 +15,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from cgwm.pipeline.control.hand_plant import HandScenePlant, HandTruth
-from cgwm.pipeline.control.hand_world import HandWorld
+from cgwm.pipeline.control.hand.plant import HandScenePlant, HandTruth
+from cgwm.pipeline.control.hand.world import HandWorld
 from cgwm.pipeline.control.horizon import Array
 from cgwm.schemas import NotConvergedError
 
@@ -41,7 +41,7 @@ class PipedPlant:
         return self._asked(("open", task, task._source, hand.joints, hand.home))
 
     def reset(self, position_m: Array, quat_wxyz: Array) -> HandTruth:
-        """See `cgwm.pipeline.control.hand_plant.HandPlant`."""
+        """See `cgwm.pipeline.control.hand.plant.HandPlant`."""
         return self._asked(("reset", position_m, quat_wxyz))
 
     def advance(self, target_rad: Array, interval_s: float) -> HandTruth:

@@ -26,9 +26,9 @@ from typing import Any
 
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.models.model import read_model
-from cgwm.pipeline.diagnose.contact_search import TESTS
-from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData, ContactTest, selected
-from cgwm.pipeline.diagnose.evidence import Evidence
+from cgwm.pipeline.diagnose.contact.contact_test import ContactData, ContactTest, selected
+from cgwm.pipeline.diagnose.contact.search import TESTS
+from cgwm.pipeline.diagnose.evidence.evidence import Evidence
 from cgwm.pipeline.diagnose.stage import library_of, prepared_world
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.diagnose.verdict import Findings, find

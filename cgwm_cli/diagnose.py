@@ -82,7 +82,7 @@ def diagnose(
     require_models_first("diagnose", [model], capture)
     with loading():
         from ..pipeline.diagnose import diagnose as work
-        from ..pipeline.diagnose.page import default_page
+        from ..pipeline.diagnose.report.page import default_page
 
     wanted = [name.strip() for name in candidates.split(",") if name.strip()]
     place = page or default_page(model, split)
@@ -91,7 +91,7 @@ def diagnose(
 
 
 def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> str:
-    from ..pipeline.diagnose.next_command import next_command
+    from ..pipeline.diagnose.report.next_command import next_command
     from ..pipeline.report.page import listed
     from .output import next_line, table, warnings
 

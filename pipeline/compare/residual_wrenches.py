@@ -10,8 +10,14 @@ from numpy.typing import NDArray
 
 from ...schemas import CovariateShare, Phase
 from ..physics.world import World
+from ..segments.flights.residual_wrench import (
+    ResidualWrenches,
+    coordinates_of,
+    covariates_of,
+    motion_axes,
+    wrench_windows,
+)
 from ..segments.prepare import Prepared
-from ..segments.residual_wrench import ResidualWrenches, coordinates_of, covariates_of, motion_axes, wrench_windows
 from ..trajectories.segmentation import Segment
 from .short_horizon_errors import ShortErrors, ShortFit
 

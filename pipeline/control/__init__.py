@@ -2,7 +2,7 @@
 
 from .closed_loop import ClosedLoop, Reach, Targets, Velocity
 from .controller import Controller
-from .hand_controller import HandController
+from .hand.controller import HandController
 from .planning import ControlPlan, ControlState
 from .replay import Following, replays_of, replays_or_following
 from .stage import control

@@ -21,12 +21,12 @@ from ...datasets.capture.cameras import Camera
 from ...datasets.models.model import Model
 from ...schemas import InputDataError, NotConvergedError, UsageError, did_you_mean
 from ..geometry.rotation import quat_normalize, quat_rotate, quat_turn
-from ..physics.chain import Chain
-from ..physics.chain_state import joints_of
+from ..physics.chains.chain import Chain
+from ..physics.chains.joint_command import JointCommand
+from ..physics.chains.state import joints_of
 from ..physics.checks import require_apart
-from ..physics.joint_command import JointCommand
 from ..physics.kinematic import Drive
-from ..physics.thin_walls import require_thick_walls
+from ..physics.surfaces.thin_walls import require_thick_walls
 from ..physics.world import State
 from .frame_renderer import FrameRenderer
 from .loop_physics import SIZES, DeviceState, numbers_of, state_of, stepper_of

@@ -26,8 +26,8 @@ from ...schemas.documents import parse_json
 from ..physics.world import State
 from ..runtime.checkpoint import Checkpoint
 from .film import AHEAD_S, predicted_at, visible_model
-from .hand_film import dotted_model
-from .hand_replay import hand_of_runs, hand_replays
+from .hand.film import dotted_model
+from .hand.replay import hand_of_runs, hand_replays
 from .horizon import Array
 from .noted_runs import NOW, seed_slot, tables_kept, version
 from .replayed_states import replay_of

@@ -13,12 +13,12 @@ from ...schemas import AnyTask, ClockName, ControlTask, SolverName
 from ..physics.world import World
 from .controller import Controller
 from .film import film_of
-from .hand_controller import HandController
-from .hand_film import hand_film_of
-from .hand_loop import goals_of, hand_errors, hand_start, run_hand
-from .hand_plant import HandModelPlant, HandPlant, HandScenePlant
-from .hand_tables import hand_tables_of
-from .hand_world import hand_world
+from .hand.controller import HandController
+from .hand.film import hand_film_of
+from .hand.loop import goals_of, hand_errors, hand_start, run_hand
+from .hand.plant import HandModelPlant, HandPlant, HandScenePlant
+from .hand.tables import hand_tables_of
+from .hand.world import hand_world
 from .loop import Measured, Recording, Watch, run, unwatched
 from .mujoco_plant import MujocoPlant
 from .planning import PlanningController

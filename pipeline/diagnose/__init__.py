@@ -1,7 +1,7 @@
 """Diagnosis: find the physical or measurement effect that a model lacks, and the experiment that would identify it.
 
-`stage` runs it; `verdict` decides; `flight_search` and `contact_search` select effects; `contact_tests` holds the tests
-in contact; `next_experiment` ranks experiments.
+`stage` runs it and `verdict` decides. `flight` and `contact` search for effects, whose `evidence` is of one kind;
+`next_experiment` ranks throws and motions; `report` puts the verdict into words and on a page.
 """
 
 from .stage import diagnose

@@ -22,10 +22,10 @@ from ..segments.contact_phases import PHASES, PhaseName, contact_phases
 from ..segments.prepare import whole_flights
 from ..segments.segment_states import fit_states
 from ..segments.segments import Segments
-from ..segments.sliding_fit import StartedSliding, nuisance_parameters
+from ..segments.sliding.fit import StartedSliding, nuisance_parameters
 from ..trajectories.innovations import WHITE
-from .evidence import Evidence
-from .flight_findings import FlightFindings
+from .evidence.evidence import Evidence
+from .flight.findings import FlightFindings
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.verdict

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..physics.effects.effect import Effect
-from ..segments.residual_wrench import TERMS, ResidualWrenches, unit_acceleration
+from ..segments.flights.residual_wrench import TERMS, ResidualWrenches, unit_acceleration
 from .thresholds import THRESHOLDS
 
 LIMITS = THRESHOLDS.experiment

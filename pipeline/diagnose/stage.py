@@ -44,26 +44,22 @@ from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.candidates import Candidate, admissible
 from ..segments.center_of_mass import as_one_body
 from ..segments.described_motion import not_described
+from ..segments.flights.residual_wrench import Omnibus, covariates_of, wrench_windows
 from ..segments.group_parameters import with_known_groups
 from ..segments.input_checks import check_observability, check_units_and_geometry
 from ..segments.prepare import Prepared, prepare
-from ..segments.residual_wrench import Omnibus, covariates_of, wrench_windows
-from .detection_limits import DetectionLimit
+from .contact.detection_limits import DetectionLimit
 from .episodes import DiagnosedEpisodes, diagnosed_episodes
-from .evidence import Evidence
-from .experiments import DEFAULT, Experiment, experiments_of, read_experiments
+from .evidence.evidence import Evidence
 from .law_export import require_law_file, save_law
-from .next_command import next_command
-from .next_experiment import next_experiment
-from .next_motions import next_motions
-from .page import diagnosis_html, mark_of
-from .pictures import pictures_of
+from .next_experiment.experiments import DEFAULT, Experiment, experiments_of, read_experiments
+from .next_experiment.motions import next_motions
+from .next_experiment.throws import next_experiment
 from .remaining import held_out_of, remaining_of
-from .sparse_regression import residual_law
-from .thresholds import THRESHOLDS
-from .unlike_episodes import unlike_episodes, unlike_warnings
-from .verdict import Findings, find
-from .wording import (
+from .report.next_command import next_command
+from .report.page import diagnosis_html, mark_of
+from .report.pictures import pictures_of
+from .report.wording import (
     law_warnings,
     misfit_warnings,
     motion_warnings,
@@ -72,6 +68,10 @@ from .wording import (
     size_warnings,
     unseen_motion,
 )
+from .sparse_regression import residual_law
+from .thresholds import THRESHOLDS
+from .unlike_episodes import unlike_episodes, unlike_warnings
+from .verdict import Findings, find
 
 JOINTED = (
     "of the jointed body '{name}' the motion of the centre of mass of its links was examined, in flight alone: what "

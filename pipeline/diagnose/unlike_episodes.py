@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..segments.flights.residual_wrench import residual_wrenches
 from ..segments.prepare import Prepared
-from ..segments.residual_wrench import residual_wrenches
 from ..trajectories.track_noise import MAD_TO_STD
 from .thresholds import THRESHOLDS
 

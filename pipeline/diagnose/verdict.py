@@ -11,16 +11,16 @@ from ...schemas import PhaseMisfit
 from ..physics.world import World
 from ..segments.candidates import Candidate, without_effect
 from ..segments.prepare import Prepared
-from ..segments.sliding_fit import StartedSliding
-from .contact_search import TESTS, Chosen, ContactFindings, with_contact
-from .contact_tests.contact_test import ContactTest
-from .cross_validation import held_out_errors, held_out_fall
-from .detection_limits import DetectionLimit
-from .effect_selection import SelectionStep
-from .evidence import Evidence
-from .flight_findings import FlightFindings, flight_findings
-from .flight_omnibus import is_significant
-from .other_forms import OtherForms
+from ..segments.sliding.fit import StartedSliding
+from .contact.contact_test import ContactTest
+from .contact.detection_limits import DetectionLimit
+from .contact.search import TESTS, Chosen, ContactFindings, with_contact
+from .evidence.cross_validation import held_out_errors, held_out_fall
+from .evidence.effect_selection import SelectionStep
+from .evidence.evidence import Evidence
+from .flight.findings import FlightFindings, flight_findings
+from .flight.omnibus import is_significant
+from .flight.other_forms import OtherForms
 from .remaining import bad_ones, misfits_of, slides_of
 from .thresholds import THRESHOLDS
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ...datasets.models.model import Model
 from ...schemas import ArticulationModel
-from ..physics.chain import chain_of_model
+from ..physics.chains.chain import chain_of_model
 
 Pose = tuple[np.ndarray, np.ndarray]
 """Position [m] (3,) and rotation matrix (3, 3)."""

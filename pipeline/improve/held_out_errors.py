@@ -15,7 +15,7 @@ from ...datasets.models.model import Model
 from ...schemas import ErrorRatio, FileModel
 from ..compare.paired_difference import LEAST_EPISODES, RESAMPLES
 from ..compare.short_horizon_errors import DIVERGED
-from ..diagnose.cross_validation import continued
+from ..diagnose.evidence.cross_validation import continued
 from ..optimization.tails import student_quantile
 from ..physics.world import World
 from ..runtime.resources import one_torch_thread

@@ -24,7 +24,7 @@ from ...schemas import (
     UsageError,
     read_json,
 )
-from ..diagnose.experiments import Experiment
+from ..diagnose.next_experiment.experiments import Experiment
 from ..diagnose.stage import prepared_world, report
 from ..fit import fit
 from ..physics.effects.registry import effect_of

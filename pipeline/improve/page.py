@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ...schemas import ImproveResult, ImproveStep, ImproveTest, ImproveTestFigures
-from ..diagnose.page import asked_motions, drawn_throw
-from ..diagnose.pictures import DrawnMotion
+from ..diagnose.report.page import asked_motions, drawn_throw
+from ..diagnose.report.pictures import DrawnMotion
 from ..report.page import (
     cautions,
     command,

@@ -26,8 +26,8 @@ from ...schemas import (
     read_json,
 )
 from ...schemas.printable import typed_path
-from ..diagnose.experiments import DEFAULT, experiments_of, read_experiments
-from ..diagnose.pictures import DrawnMotion, throw_of
+from ..diagnose.next_experiment.experiments import DEFAULT, experiments_of, read_experiments
+from ..diagnose.report.pictures import DrawnMotion, throw_of
 from ..diagnose.stage import library_of
 from ..fit import fit
 from ..physics.world import World

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from ...schemas import DiagnoseResult, ErrorRatio, ImproveStep, ImproveTest, ImproveTrial, Remaining
 from ..compare.paired_difference import LEAST_EPISODES
-from ..diagnose.wording import organised
+from ..diagnose.report.wording import organised
 from ..physics.effects.registry import split_units
 from ..report.page import listed
 from .ladder import LEAST_FALL, Ladder

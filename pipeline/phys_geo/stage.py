@@ -29,7 +29,7 @@ from ...schemas import (
     UsageError,
 )
 from ...schemas.materials import pair_of
-from ..physics.chain_values import FACTORS, with_chain_values
+from ..physics.chains.values import FACTORS, with_chain_values
 from ..physics.effects.registry import effect_of
 from ..physics.rollout_cost import durations
 from ..physics.world import Body, World, inertia_elements

@@ -14,7 +14,7 @@ from ...schemas import InputDataError
 from ..geometry.rotation import quat_to_matrix
 from ..physics.checks import DEEPEST_SHARE
 from ..physics.contact_detection import Placed
-from ..physics.surface_detection import surface_depth
+from ..physics.surfaces.detection import surface_depth
 from ..physics.world import World
 
 FRAMES = 200

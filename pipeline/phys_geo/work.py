@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ...schemas import PhysConfig
-from ..physics.chain_parameters import chain_parameters
+from ..physics.chains.parameters import chain_parameters
 from ..physics.parameters import contact_parameters
 from ..physics.rollout_cost import rollout_part
 from ..physics.world import World

@@ -1,10 +1,10 @@
 """Contact geometry, dynamics and simulation of bodies made of spheres."""
 
-from .chain import Chain, Joint
-from .chain_state import joints_of, with_joints
+from .chains.chain import Chain, Joint
+from .chains.joint_command import JointCommand
+from .chains.state import joints_of, with_joints
 from .contact_law import ContactLaw, damping_ratio_of, restitution
 from .contact_record import ContactRecord
-from .joint_command import JointCommand
 from .paper_law import PaperLaw
 from .rollout import Rollout, simulate
 from .world import Body, State, World, symmetric

@@ -12,12 +12,12 @@ from torch import Tensor
 from ...schemas import InputDataError, UsageError
 from ...schemas.materials import of_pair
 from ..geometry.rotation import quat_to_matrix
-from .chain_state import require_chains
+from .chains.state import require_chains
 from .contact_detection import GROUND, Placed, body_points, near_body, pairs_of, plain
 from .contact_law import ContactLaw
 from .pair_laws import laws_in_use
 from .paper_law import PaperLaw, stable_step
-from .surface_detection import surface_depth
+from .surfaces.detection import surface_depth
 from .world import State, World
 
 DEEPEST_SHARE = 0.25

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .contact_detection import FAR_M, GROUND, Placed, Points, all_body_points, ground_points, pairs_of, slot_count
 from .contact_solver import PairImpulses, put
-from .surface_detection import all_surface_points
+from .surfaces.detection import all_surface_points
 from .world import World
 
 SLIDES = 0.99

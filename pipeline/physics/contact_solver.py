@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...schemas import UsageError
 from ..geometry.rotation import cross
-from .chain_stepping import ChainStepper, owners
+from .chains.stepping import ChainStepper, owners
 from .contact_detection import (
     GROUND,
     ROUNDING_M,
@@ -25,12 +25,12 @@ from .contact_detection import (
     slot_count,
 )
 from .contact_law import ContactLaw, Touch
-from .fixed_surface import FixedSurface
 from .friction_ellipse import Ellipse
 from .impulse_solver import ContactGroup, Impulses, Rows, solve_with_joints, tangent_axes
 from .paper_law import PaperLaw, paper_impulses
 from .rigid_body import Inertia, Motion
-from .surface_detection import Nearby, near_surface, surface_points
+from .surfaces.detection import Nearby, near_surface, surface_points
+from .surfaces.fixed_surface import FixedSurface
 from .world import Body, World
 
 

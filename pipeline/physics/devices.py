@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from .chain import Chain
-from .chain_state import made_likewise
+from .chains.chain import Chain
+from .chains.state import made_likewise
 from .world import State
 
 T = TypeVar("T")

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ..optimization.forward_mode import parts_of
 from ..runtime.kernel_build import compiler
-from .chain import Joint
+from .chains.chain import Joint
+from .chains.joint_command import JointCommand
 from .contact_detection import pairs_of, slot_count
 from .fused import simulate_fused, unsupported
 from .fused.host import lacking, simulate_on_host
-from .joint_command import JointCommand
 from .kinematic import Drive
 from .rollout import Rollout, simulate
 from .world import State, World

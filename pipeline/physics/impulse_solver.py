@@ -23,7 +23,7 @@ from .contact_law import Touch, coefficients
 from .friction_ellipse import TINY, Ellipse
 
 if TYPE_CHECKING:
-    from .joint_rows import JointRows
+    from .chains.joint_rows import JointRows
 
 CONTACT_ONSET_M = 2e-4
 """Depth [m] from which a contact takes its full share of a body's mass; below, the share grows smoothly."""

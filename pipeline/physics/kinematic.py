@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...schemas import InputDataError
 from ..geometry.rotation import quat_exp, quat_multiply, quat_rotate, quat_turn
-from .joint_command import JointCommand
+from .chains.joint_command import JointCommand
 from .rigid_body import Motion
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...schemas.materials import of_pair
-from .chain_values import with_chain_values
+from .chains.values import with_chain_values
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .pair_laws import laws_in_use

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from ...schemas import NotConvergedError
 from ..geometry.rotation import quat_to_matrix
-from .chain_dynamics import CentralMotion
-from .chain_stepping import ChainStepper
+from .chains.dynamics import CentralMotion
+from .chains.joint_command import JointCommand
+from .chains.stepping import ChainStepper
 from .checks import require_physical, require_state
 from .contact_detection import Placed
 from .contact_record import ContactRecord, Recorder
 from .contact_solver import Contacts, PairImpulses
 from .effects.effect import BodyMotion, changed_by_effects
-from .joint_command import JointCommand
 from .kinematic import Drive
 from .rigid_body import Inertia, Motion, advance, finish, start
 from .world import State, World

@@ -11,8 +11,8 @@ from typing import Protocol
 import torch
 
 from ...schemas import UsageError
+from .chains.joint_command import JointCommand
 from .checks import require_physical, require_state
-from .joint_command import JointCommand
 from .kinematic import Drive
 from .rigid_body import Motion
 from .rollout import Engine

@@ -15,15 +15,15 @@ from torch import Tensor
 
 from ...schemas import InputDataError, UsageError
 from ...schemas.materials import pair_of
-from .chain import Chain, chain_of_model
+from .chains.chain import Chain, chain_of_model
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
 from .effects.registry import effect_of
-from .fixed_surface import FixedSurface, shape_of, surface_mesh
 from .hull import Hull
 from .paper_law import PaperLaw
 from .patch import Patch
 from .smooth_distance import plane_contacts
+from .surfaces.fixed_surface import FixedSurface, shape_of, surface_mesh
 
 if TYPE_CHECKING:
     from ...datasets.models.model import Model

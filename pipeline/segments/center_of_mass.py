@@ -16,7 +16,7 @@ from torch import Tensor
 from ...datasets.capture.tracks import Episode, Track
 from ...schemas import InputDataError
 from ..geometry.rotation import quat_rotate
-from ..physics.chain import Chain
+from ..physics.chains.chain import Chain
 from ..physics.world import Body, World
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import cut_episodes, size_of, whole_episodes

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.rotation import continuous_turns, quat_exp, quat_multiply
-from ..physics.chain_state import on_joints
+from ..physics.chains.state import on_joints
 from ..physics.contact_law import ContactLaw
 from ..physics.engine import rollout as rolled_out
 from ..physics.engine import rollouts_at_once

@@ -11,8 +11,8 @@ from ...datasets.models.effect_files import packed_name
 from ...datasets.models.mjcf import mujoco_states, write_mjcf
 from ...datasets.rollouts.rollouts import JointTable, RolloutLabels
 from ...schemas import ModelFile, SamplingPlan
-from ..physics.chain import chain_of_model
-from ..physics.chain_state import joint_values
+from ..physics.chains.chain import chain_of_model
+from ..physics.chains.state import joint_values
 from ..physics.net_contact_wrench import contact_force_n, contact_torque_n_m
 from ..physics.world import State
 from .pusher_paths import commanded_velocity

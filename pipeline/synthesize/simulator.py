@@ -19,7 +19,8 @@ from torch import Tensor
 from ...datasets.models.model import Model
 from ...datasets.rollouts.rollouts import ContactTable
 from ...schemas import ModelFile, NotConvergedError
-from ..physics.chain_state import joints_of
+from ..physics.chains.joint_command import JointCommand
+from ..physics.chains.state import joints_of
 from ..physics.checks import require_apart
 from ..physics.contact_record import ContactRecord
 from ..physics.devices import on_device
@@ -27,10 +28,9 @@ from ..physics.effects.effect import changed_by_effects
 from ..physics.engine import rollout as roll_out
 from ..physics.fused import unsupported
 from ..physics.fused.host import lacking
-from ..physics.joint_command import JointCommand
 from ..physics.kinematic import Drive
 from ..physics.rollout import Rollout, require_finite
-from ..physics.thin_walls import require_thick_walls
+from ..physics.surfaces.thin_walls import require_thick_walls
 from ..physics.world import State, World
 from ..runtime.kernel_build import compiler_version
 from .draw import Draw

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ...datasets.models.model import Model
 from ..physics.contact_detection import Placed
-from ..physics.fixed_surface import HALF_SPACE, FixedSurface
-from ..physics.surface_detection import surface_depth
+from ..physics.surfaces.detection import surface_depth
+from ..physics.surfaces.fixed_surface import HALF_SPACE, FixedSurface
 from ..physics.world import Body, fixed_surfaces
 from .plan import up_direction
 

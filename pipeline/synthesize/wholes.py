@@ -19,7 +19,7 @@ from ...schemas import ArticulationModel, InputDataError
 from ...schemas.articulations import JointModel
 from ..geometry.rotation import quat_conjugate, quat_rotate
 from ..geometry.viewpoint import rotation_matrix
-from ..physics.chain import Chain, chain_of_model, link_velocities
+from ..physics.chains.chain import Chain, chain_of_model, link_velocities
 
 StartArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Position, quaternion, velocity and omega_body of all bodies."""

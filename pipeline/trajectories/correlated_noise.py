@@ -5,7 +5,7 @@ neighbouring frames share. Forces are identified by slow changes, and correlated
 process of Matern's class plus white noise: with a share s of the variance whose correlation is k(dt), the covariance of
 two frames is s k(dt), plus 1 - s on the diagonal (see `innovations`). The order of the process matters: of errors that
 a filter has smoothed, one that is not differentiable makes the slow part a hundred times too large. Errors slower than
-a window do not show here; they are looked for in whole flights (`segments/slow_errors`).
+a window do not show here; they are looked for in whole flights (`segments/flights/slow_errors`).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode, Track
 from ...schemas import InputDataError
 from ..geometry.rotation import continuous_turns, matrix_to_quat
-from ..physics.chain_state import on_joints
+from ..physics.chains.state import on_joints
 from ..physics.kinematic import Drive
 from ..physics.parameters import with_own
 from ..physics.world import State, World

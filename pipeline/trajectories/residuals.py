@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..geometry.rotation import quat_exp, quat_multiply, quat_turn
 from ..optimization.forward_mode import batched_jacobian
-from ..physics.chain_state import on_joints
+from ..physics.chains.state import on_joints
 from ..physics.engine import length_groups, ragged_rollout
 from ..physics.observation_model import measure
 from ..physics.parameters import Parameter, apply_parameters

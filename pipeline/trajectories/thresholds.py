@@ -181,7 +181,7 @@ class SegmentationThresholds:
         "s",
         "longer flights are cut into equal parts",
         NOT_KNOWN,
-        "where the tracks have slow errors, parts of one flight are joined again (`segments/slow_errors`)",
+        "where the tracks have slow errors, parts of one flight are joined again (`segments/flights/slow_errors`)",
     )
     least_flight_s: float = threshold(
         0.06,

@@ -9,7 +9,7 @@ import torch
 
 from ...schemas import ArticulationModel
 from ..geometry.rotation import quat_rotate
-from ..physics.chain import chain_of_model, link_velocities
+from ..physics.chains.chain import chain_of_model, link_velocities
 from .faults import Fault
 from .rollout import Rollout, shown
 

@@ -12,14 +12,14 @@ from ...datasets.models.effect_files import packed_name
 from ...datasets.models.model import Model
 from ...schemas import CgwmError, InputDataError, ModelFile
 from ..geometry.rotation import quat_to_matrix
-from ..physics.chain_state import joints_of, with_joints
+from ..physics.chains.joint_command import JointCommand
+from ..physics.chains.state import joints_of, with_joints
 from ..physics.checks import require_apart
 from ..physics.effects.registry import BUILT_IN
 from ..physics.engine import rollout
 from ..physics.fused.host import lacking
-from ..physics.joint_command import JointCommand
 from ..physics.rollout import Rollout, simulate
-from ..physics.thin_walls import thin_wall_warnings
+from ..physics.surfaces.thin_walls import thin_wall_warnings
 from ..physics.world import State, World
 
 LENGTH_S = 1.0

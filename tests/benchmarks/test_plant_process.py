@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cgwm.pipeline.control.hand_plant import HandScenePlant
+from cgwm.pipeline.control.hand.plant import HandScenePlant
 from helpers.paddles import JOINTS, hand_task, write_hand
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cgwm.pipeline.diagnose.contact_tests.contact_test import ContactData
-from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
-from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.diagnose.contact.contact_test import ContactData
+from cgwm.pipeline.diagnose.contact.sliding import SlidingTest
+from cgwm.pipeline.diagnose.evidence.evidence import Evidence
+from cgwm.pipeline.diagnose.evidence.score_test import ScoreTest
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.segments.candidates import Candidate
 from helpers.diagnosis_data import world_with

@@ -16,7 +16,7 @@ from cgwm.cli.app import app
 from cgwm.cli.execution import with_values
 from cgwm.cli.settings import StageSettings
 from cgwm.datasets.capture.tracks import read_tracks
-from cgwm.pipeline.diagnose.experiments import read_experiments
+from cgwm.pipeline.diagnose.next_experiment.experiments import read_experiments
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import (

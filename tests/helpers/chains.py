@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from cgwm.pipeline.physics import Body, State, World
-from cgwm.pipeline.physics.chain import Chain, Joint
+from cgwm.pipeline.physics.chains.chain import Chain, Joint
 from cgwm.pipeline.physics.kinematic import Drive
 
 from . import worlds

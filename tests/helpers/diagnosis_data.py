@@ -11,8 +11,8 @@ from cgwm.datasets.capture.manifest import write_manifest
 from cgwm.datasets.capture.tracks import Track, write_tracks
 from cgwm.datasets.models.model import Model, write_model
 from cgwm.datasets.shapes.ply import Splats
-from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.score_test import ScoreTest
+from cgwm.pipeline.diagnose.evidence.evidence import Evidence
+from cgwm.pipeline.diagnose.evidence.score_test import ScoreTest
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics import State, World
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from cgwm.pipeline.physics.fixed_surface import BOX, CYLINDER, HALF_SPACE, MESH, FixedSurface
-from cgwm.pipeline.physics.mesh_topology import Topology
-from cgwm.pipeline.physics.surface_mesh import SurfaceMesh
+from cgwm.pipeline.physics.surfaces.fixed_surface import BOX, CYLINDER, HALF_SPACE, MESH, FixedSurface
+from cgwm.pipeline.physics.surfaces.mesh_topology import Topology
+from cgwm.pipeline.physics.surfaces.surface_mesh import SurfaceMesh
 
 from .worlds import batch
 

@@ -22,14 +22,14 @@ from ...physics.world import World
 from ...segments.candidates import base_values
 from ...segments.first_contact_fit import EffectEstimate, placed
 from ...segments.fitted_parameters import fitted_parameter
-from ...segments.impact_fit import BASE, ImpactBase, fit_impacts
-from ...segments.impact_velocities import measured_impacts
+from ...segments.flights.slow_errors import slow_errors
+from ...segments.impacts.fit import BASE, ImpactBase, fit_impacts
+from ...segments.impacts.velocities import measured_impacts
 from ...segments.prepare import Prepared, prepare
 from ...segments.segment_fit import linearised, refit
 from ...segments.session_spread import beside_sessions
-from ...segments.sliding_descent import information_by_segment
-from ...segments.sliding_fit import StartedSliding, contact_effect_parameters, fit_sliding, nuisance_parameters
-from ...segments.slow_errors import slow_errors
+from ...segments.sliding.descent import information_by_segment
+from ...segments.sliding.fit import StartedSliding, contact_effect_parameters, fit_sliding, nuisance_parameters
 from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ...trajectories.track_noise import Noise
 from .identified_effects import at_neutral, identified_effects

@@ -22,9 +22,9 @@ from ...physics.contact_law import ContactLaw, damping_ratio_of, restitution
 from ...physics.engine import rollout
 from ...physics.parameters import CONTACT_TIME, DAMPING_RATIO, Parameter
 from ...physics.world import State, World
-from ...segments.bounces import gravity_into_ground
 from ...segments.first_contact_fit import placed
-from ...segments.restitution_fit import RestitutionFit
+from ...segments.impacts.bounces import gravity_into_ground
+from ...segments.impacts.restitution import RestitutionFit
 
 PHASES = 4
 """Places within a step at which a simulated impact begins: its restitution differs a little between them."""

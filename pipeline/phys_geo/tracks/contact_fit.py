@@ -1,7 +1,7 @@
 """The stage phys-geo on measured tracks: contact parameters, and where asked for effects and the mass distribution.
 
 1. The noise of the tracks, given or estimated from them.
-2. The damping of a ball from the heights on both sides of its bounces (`segments/restitution_fit.py`): the search takes
+2. The damping of a ball from the heights on both sides of its bounces (`segments/impacts`): the search takes
    a missing drag, a late rebound and the prior for restitution.
 3. What held-out tosses ask for beside the contact (`part_choice.py`): where it is chosen or asked for, the mass
    distribution (`inertia_fit.py`), then the effects of the world (`effect_fit.py`), a scale of lengths among them.
@@ -31,7 +31,7 @@ from ....datasets.io.progress import note
 from ....schemas import FitChoice, InputDataError, PhysConfig
 from ....schemas.materials import of_pair
 from ...optimization.importance_sampling import episode_covariance
-from ...physics.chain_parameters import chain_parameters
+from ...physics.chains.parameters import chain_parameters
 from ...physics.effects import ActiveEffect, load_effect
 from ...physics.effects.recording import no_recording
 from ...physics.pair_laws import laws_in_use
@@ -52,7 +52,7 @@ from ...runtime.resources import one_torch_thread
 from ...segments.center_of_mass import as_one_body
 from ...segments.first_contact_fit import EffectEstimate
 from ...segments.fitted_parameters import bound_warnings
-from ...segments.restitution_fit import RestitutionFit, restitution_of
+from ...segments.impacts.restitution import RestitutionFit, restitution_of
 from ...segments.segments import world_for
 from ...trajectories.initial_state import estimate_states, flight_frames, warmup_frames
 from ...trajectories.observations import Observations

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from ....datasets.capture.tracks import Episode, Track
 from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
-from ...physics.chain_parameters import LOSSES, chain_parameters, mass_factor
+from ...physics.chains.parameters import LOSSES, chain_parameters, mass_factor
 from ...physics.parameters import GAP, Parameter, gap_parameters
 from ...physics.world import World
 from ...trajectories.initial_state import clearance

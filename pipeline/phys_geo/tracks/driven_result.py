@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 
 from ....schemas.materials import of_pair
-from ...physics.chain_values import with_chain_values
+from ...physics.chains.values import with_chain_values
 from ...physics.parameters import CONTACT_TIME, DAMPING_RATIO, FRICTION, GROUND_SHIFT, Parameter
 from ...physics.world import World
 from ...segments.fitted_parameters import LIMITS

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....datasets.capture.tracks import Track
-from ...physics.chain import Chain
-from ...physics.chain_dynamics import Balance, ChainDynamics, ChainMotion
-from ...physics.chain_values import with_chain_values
+from ...physics.chains.chain import Chain
+from ...physics.chains.dynamics import Balance, ChainDynamics, ChainMotion
+from ...physics.chains.values import with_chain_values
 from ...physics.world import World
 from .joint_tracks import JointTracks
 from .measured_forces import NOISY_CHANGE

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...physics.chain_state import on_joints
+from ...physics.chains.state import on_joints
 from ...physics.engine import rollout as rolled_out
 from ...physics.kinematic import Drive
 from ...physics.observation_model import true_times

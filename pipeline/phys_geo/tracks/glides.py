@@ -28,7 +28,7 @@ from torch import Tensor
 
 from ....datasets.capture.tracks import Episode
 from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
-from ...physics.chain_parameters import LOSSES, chain_parameters
+from ...physics.chains.parameters import LOSSES, chain_parameters
 from ...physics.parameters import Parameter
 from ...physics.world import World
 from ...trajectories.initial_state import clearance

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
-from ...physics.chain import Chain
-from ...physics.chain_dynamics import Balance, ChainDynamics, ChainMotion
-from ...physics.chain_state import joint_values
+from ...physics.chains.chain import Chain
+from ...physics.chains.dynamics import Balance, ChainDynamics, ChainMotion
+from ...physics.chains.state import joint_values
 from ...physics.world import State, World
 from ...trajectories.observations import Observations
 from ...trajectories.track_noise import Noise

@@ -26,7 +26,7 @@ from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ...optimization.least_squares import Descent, Policy, descend
 from ...optimization.levenberg_marquardt import robust_loss
 from ...optimization.problem import Box, NormalEquations, Point, Problem, Rows
-from ...physics.chain_state import on_joints
+from ...physics.chains.state import on_joints
 from ...physics.engine import ragged_rollout, rollouts_at_once
 from ...physics.engine import rollout as rolled_out
 from ...physics.observation_model import as_measured, true_times

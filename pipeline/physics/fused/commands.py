@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ..joint_command import JointCommand
+from ..chains.joint_command import JointCommand
 from ..kinematic import Drive
 from ..world import World
 from . import tree

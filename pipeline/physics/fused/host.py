@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ...runtime import kernel_build
 from ...runtime.resources import kernel_threads
-from ..joint_command import JointCommand
+from ..chains.joint_command import JointCommand
 from ..kinematic import Drive
 from ..rollout import Rollout
 from ..world import State, World

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..fixed_surface import FixedSurface
-from ..surface_mesh import SurfaceMesh
+from ..surfaces.fixed_surface import FixedSurface
+from ..surfaces.surface_mesh import SurfaceMesh
 
 _KEPT = 8
 """Number of sets of meshes whose arrays are kept: rollouts of one world follow each other."""

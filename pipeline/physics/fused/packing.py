@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from ..chains.joint_command import JointCommand
 from ..contact_detection import GROUND, edge_slots, pairs_of, slot_count
 from ..contact_law import ContactLaw, coefficients
-from ..fixed_surface import HALF_SPACE, FixedSurface
-from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..pair_laws import laws_in_use
 from ..rigid_body import start
+from ..surfaces.fixed_surface import HALF_SPACE, FixedSurface
 from ..world import Body, State, World
 from . import tree, wrenches
 from .commands import Commands

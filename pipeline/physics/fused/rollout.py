@@ -12,10 +12,10 @@ from ....schemas import UsageError
 from ...geometry.rotation import quat_conjugate, quat_multiply, quat_rotate
 from ...optimization.forward_mode import dual_of, parts_of
 from ...runtime import kernel_build
+from ..chains.joint_command import JointCommand
 from ..checks import require_physical, require_state
 from ..contact_record import ContactRecord
 from ..effects.effect import changed_by_effects
-from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..rollout import Rollout
 from ..world import State, World

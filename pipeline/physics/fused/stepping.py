@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ....schemas import UsageError
+from ..chains.joint_command import JointCommand
 from ..checks import require_physical, require_state
 from ..effects.effect import changed_by_effects
-from ..joint_command import JointCommand
 from ..kinematic import Drive
 from ..world import State, World
 from .commands import Commands

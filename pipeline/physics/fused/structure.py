@@ -8,14 +8,14 @@ from functools import cache, cached_property
 from itertools import product
 
 from ...runtime import kernel_build
+from ..chains.joint_rows import LIMIT_TIME_S
 from ..contact_detection import FAR_M, PAIR_SMOOTHING_M
 from ..edge_contact import FACE_SLACK_M, LEAST_CROSSING, OUT_OF_FACE
-from ..fixed_surface import BOX, HALF_SPACE, MESH
 from ..friction_ellipse import CLOSE, FLATTEST, LEAST, NEWTON_STEPS
 from ..hull import MOST_PLANES, OVERHANG_M, PARALLEL, SAME_NORMAL, SAME_PLANE_M
 from ..impulse_solver import CONTACT_ONSET_M, IMMOVABLE, LEAST_ACROSS, LEAST_MOBILITY
-from ..joint_rows import LIMIT_TIME_S
-from ..surface_mesh import FLAT, MESH_CONTACTS, ORDER
+from ..surfaces.fixed_surface import BOX, HALF_SPACE, MESH
+from ..surfaces.surface_mesh import FLAT, MESH_CONTACTS, ORDER
 from .tree import COMMAND_WIDTH, FREE_ROOT, JOINT_COLUMNS, LINK_COLUMNS, Tree, listed, listed_copies, lists_bytes
 
 WARP = 32

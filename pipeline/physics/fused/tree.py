@@ -12,9 +12,9 @@ from torch import Tensor
 
 from ...geometry.rotation import quat_rotate
 from ...optimization.forward_mode import parts_of
-from ..chain import Chain
-from ..chain_state import joints_of
-from ..joint_command import JointCommand
+from ..chains.chain import Chain
+from ..chains.joint_command import JointCommand
+from ..chains.state import joints_of
 from ..world import State, World
 
 LINK_COLUMNS, JOINT_COLUMNS, COMMAND_WIDTH = 20, 9, 14

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.robots import read_articulation
-from cgwm.pipeline.physics.articulated import Servo, chain_of
+from cgwm.pipeline.physics.chains.articulated import Servo, chain_of
 from cgwm.pipeline.sg_gs.link_spheres import link_spheres
 from cgwm.schemas import InputDataError, UsageError
 
@@ -44,7 +44,7 @@ def written(folder: Path, text: str, name: str = "arm.urdf") -> Path:
 
 
 def test_a_urdf_has_the_mass_matrix_and_poses_that_mujoco_reads(tmp_path: Path) -> None:
-    from cgwm.pipeline.physics.chain_dynamics import ChainDynamics, ChainMotion, _Place
+    from cgwm.pipeline.physics.chains.dynamics import ChainDynamics, ChainMotion, _Place
 
     path = written(tmp_path, ARM)
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -70,7 +70,7 @@ def test_a_urdf_has_the_mass_matrix_and_poses_that_mujoco_reads(tmp_path: Path) 
 
 
 def test_an_mjcf_file_has_its_servos_anchors_and_several_joints_of_a_body(tmp_path: Path) -> None:
-    from cgwm.pipeline.physics.chain_dynamics import ChainDynamics, ChainMotion, _Place
+    from cgwm.pipeline.physics.chains.dynamics import ChainDynamics, ChainMotion, _Place
 
     text = """<mujoco><compiler angle="radian"/><worldbody><body name="a" pos="0 0 1">
       <joint name="x" axis="1 0 0" pos="0.02 0 0.1" range="-1 1" damping="0.1" armature="0.01"/>

@@ -16,7 +16,7 @@ from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.datasets.shapes.surfaces import obj_text, read_surface, stored
 from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import World
-from cgwm.pipeline.physics.fixed_surface import BOX, CYLINDER, HALF_SPACE, MESH
+from cgwm.pipeline.physics.surfaces.fixed_surface import BOX, CYLINDER, HALF_SPACE, MESH
 from cgwm.schemas import InputDataError, Surface
 from helpers.fixed_surfaces import box_mesh, groove
 from helpers.small_model import small_model

@@ -9,7 +9,7 @@ from cgwm.datasets.models.model import Model
 from cgwm.pipeline.compare.residual_wrenches import wrench_points
 from cgwm.pipeline.compare.short_horizon_errors import short_errors
 from cgwm.pipeline.physics import State, World, simulate
-from cgwm.pipeline.physics.chain_state import with_joints
+from cgwm.pipeline.physics.chains.state import with_joints
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.schemas import PHASES
 from helpers.jointed_model import jointed_model

@@ -6,10 +6,10 @@ import pytest
 import torch
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.control import ClosedLoop, Targets, Velocity
-from cgwm.pipeline.physics.chain_state import joints_of, with_joints
+from cgwm.pipeline.physics.chains.joint_command import JointCommand
+from cgwm.pipeline.physics.chains.state import joints_of, with_joints
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.stepping import FusedStepper
-from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.physics.rollout import simulate
 from cgwm.pipeline.physics.world import State, World
 from cgwm.schemas import UsageError

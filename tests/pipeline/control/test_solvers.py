@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.control.controller import Controller, ControlState
-from cgwm.pipeline.control.elites import Elites
+from cgwm.pipeline.control.hand.elites import Elites
 from cgwm.pipeline.control.horizon import Horizon, Targets
 from cgwm.pipeline.control.solvers import Mppi, solver_of
 from helpers import fused_host

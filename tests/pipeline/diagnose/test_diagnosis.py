@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.capture import Capture
-from cgwm.pipeline.diagnose import diagnose, falsification, flight_search, stage
-from cgwm.pipeline.diagnose.effect_selection import SelectionStep, are_slight, repeats, select_next
-from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.falsification import consistency, fitted_numbers, repetition
-from cgwm.pipeline.diagnose.flight_equals import fitted_contact, resolved_flight, separated
-from cgwm.pipeline.diagnose.score_test import ScoreTest, score_test
+from cgwm.pipeline.diagnose import diagnose, stage
+from cgwm.pipeline.diagnose.contact.flight_equals import fitted_contact, resolved_flight, separated
+from cgwm.pipeline.diagnose.evidence.effect_selection import SelectionStep, are_slight, repeats, select_next
+from cgwm.pipeline.diagnose.evidence.evidence import Evidence, falsification
+from cgwm.pipeline.diagnose.evidence.falsification import consistency, fitted_numbers, repetition
+from cgwm.pipeline.diagnose.evidence.score_test import ScoreTest, score_test
+from cgwm.pipeline.diagnose.flight import search as flight_search
 from cgwm.pipeline.diagnose.sparse_regression import residual_law
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.optimization.tails import student_quantile, student_tail
@@ -25,9 +26,9 @@ from cgwm.pipeline.physics.effects.registry import BUILT_IN
 from cgwm.pipeline.physics.parameters import Parameter
 from cgwm.pipeline.segments.candidates import Candidate, variants_of
 from cgwm.pipeline.segments.contact_phases import phases_of
+from cgwm.pipeline.segments.flights.residual_wrench import covariates_of, omnibus, residual_wrenches, wrench_windows
 from cgwm.pipeline.segments.linearization import Linearization, linearize
 from cgwm.pipeline.segments.prepare import Prepared, prepare
-from cgwm.pipeline.segments.residual_wrench import covariates_of, omnibus, residual_wrenches, wrench_windows
 from cgwm.pipeline.segments.segment_states import fit_states
 from cgwm.pipeline.segments.segments import FLIGHT_STEP_S, Segments
 from cgwm.pipeline.trajectories.flight_noise import flight_noise, without_outliers

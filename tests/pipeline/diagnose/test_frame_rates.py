@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cgwm.pipeline.diagnose.flight_findings import _Search, flight_findings
+from cgwm.pipeline.diagnose.flight.findings import _Search, flight_findings
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.prepare import prepare

@@ -10,7 +10,7 @@ from cgwm.datasets.models.model import Model
 from cgwm.pipeline.diagnose.stage import library_of, report
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply, quat_rotate
 from cgwm.pipeline.physics import State, World, engine
-from cgwm.pipeline.physics.chain_state import with_joints
+from cgwm.pipeline.physics.chains.state import with_joints
 from cgwm.pipeline.segments.center_of_mass import as_one_body
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.schemas import InputDataError

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from cgwm.pipeline.diagnose.remaining import bad_ones, misfits_of, slides_of
 from cgwm.pipeline.segments.prepare import prepare
-from cgwm.pipeline.segments.sliding_fit import StartedSliding
+from cgwm.pipeline.segments.sliding.fit import StartedSliding
 from cgwm.schemas import PhaseMisfit
 from helpers.diagnosis_data import tosses, world_with
 from helpers.worlds import law

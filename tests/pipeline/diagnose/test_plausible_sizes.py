@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import pytest
-from cgwm.pipeline.diagnose.effect_selection import select_next
-from cgwm.pipeline.diagnose.evidence import implausible, prior_odds
+from cgwm.pipeline.diagnose.evidence.effect_selection import select_next
+from cgwm.pipeline.diagnose.evidence.evidence import implausible, prior_odds
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.diagnose.unlike_episodes import unlike_episodes, unlike_warnings
 from cgwm.pipeline.physics.effects import load_effect

@@ -13,7 +13,7 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.compare.model_comparison import ComparedModel
 from cgwm.pipeline.compare.short_horizon_errors import short_errors
 from cgwm.pipeline.diagnose import diagnose
-from cgwm.pipeline.diagnose.wording import unseen_motion
+from cgwm.pipeline.diagnose.report.wording import unseen_motion
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.geometry.rotation import quat_multiply, quat_to_matrix
 from cgwm.pipeline.physics import World

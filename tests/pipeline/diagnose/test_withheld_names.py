@@ -8,19 +8,20 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.diagnose import flight_selection, verdict
-from cgwm.pipeline.diagnose.contact_search import Chosen
-from cgwm.pipeline.diagnose.contact_tests import sliding
-from cgwm.pipeline.diagnose.contact_tests.contact_test import selected
-from cgwm.pipeline.diagnose.contact_tests.sliding import SlidingTest
-from cgwm.pipeline.diagnose.effect_selection import SelectionStep
-from cgwm.pipeline.diagnose.evidence import Evidence
-from cgwm.pipeline.diagnose.flight_selection import FlightSelection
-from cgwm.pipeline.diagnose.friction_pyramid import FrictionPyramid
-from cgwm.pipeline.diagnose.lasting_forces import without_lasting
-from cgwm.pipeline.diagnose.other_forms import OtherForms
+from cgwm.pipeline.diagnose import verdict
+from cgwm.pipeline.diagnose.contact import sliding
+from cgwm.pipeline.diagnose.contact.contact_test import selected
+from cgwm.pipeline.diagnose.contact.friction_pyramid import FrictionPyramid
+from cgwm.pipeline.diagnose.contact.search import Chosen
+from cgwm.pipeline.diagnose.contact.sliding import SlidingTest
+from cgwm.pipeline.diagnose.evidence.effect_selection import SelectionStep
+from cgwm.pipeline.diagnose.evidence.evidence import Evidence
+from cgwm.pipeline.diagnose.flight import selection as flight_selection
+from cgwm.pipeline.diagnose.flight.lasting_forces import without_lasting
+from cgwm.pipeline.diagnose.flight.other_forms import OtherForms
+from cgwm.pipeline.diagnose.flight.selection import FlightSelection
+from cgwm.pipeline.diagnose.report.wording import _called, law_warnings
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
-from cgwm.pipeline.diagnose.wording import _called, law_warnings
 from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.contact_law import Touch
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect

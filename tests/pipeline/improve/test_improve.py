@@ -12,7 +12,7 @@ from cgwm.cli.app import app
 from cgwm.datasets.io.atomic import sha256
 from cgwm.datasets.models.model import read_model, write_model
 from cgwm.datasets.synthetic.hidden_effects import cases, make_capture
-from cgwm.pipeline.diagnose.pictures import DrawnMotion
+from cgwm.pipeline.diagnose.report.pictures import DrawnMotion
 from cgwm.pipeline.improve import improve
 from cgwm.pipeline.improve.folds import ReadOnce, folds_of
 from cgwm.pipeline.improve.held_out_errors import HeldOutErrors, error_ratio, typical_error

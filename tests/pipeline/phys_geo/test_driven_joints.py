@@ -13,9 +13,9 @@ from cgwm.pipeline.phys_geo.tracks.driven_result import DrivenFit, with_nuisance
 from cgwm.pipeline.phys_geo.tracks.force_driven import ForceDriven, Grid, Pushes, Samples, hit_errors, impulse_errors
 from cgwm.pipeline.phys_geo.tracks.joint_tracks import parabola_speeds
 from cgwm.pipeline.phys_geo.tracks.loss_posterior import posterior
-from cgwm.pipeline.physics.chain import Chain, Joint
-from cgwm.pipeline.physics.chain_parameters import mass_factor
-from cgwm.pipeline.physics.chain_values import with_chain_values
+from cgwm.pipeline.physics.chains.chain import Chain, Joint
+from cgwm.pipeline.physics.chains.parameters import mass_factor
+from cgwm.pipeline.physics.chains.values import with_chain_values
 from cgwm.pipeline.physics.parameters import apply_parameters, contact_parameters, gap_parameters
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.trajectories.track_noise import Noise

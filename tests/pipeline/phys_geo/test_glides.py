@@ -8,8 +8,8 @@ from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate
 from cgwm.pipeline.phys_geo.tracks.glides import fit_gliding_joints, free_runs, moves_on, roughness
-from cgwm.pipeline.physics.chain import Chain, Joint
-from cgwm.pipeline.physics.chain_parameters import chain_parameters
+from cgwm.pipeline.physics.chains.chain import Chain, Joint
+from cgwm.pipeline.physics.chains.parameters import chain_parameters
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.chains import chained, link

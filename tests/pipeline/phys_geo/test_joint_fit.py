@@ -9,8 +9,8 @@ from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.pipeline.phys_geo.tracks import joint_fit
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
-from cgwm.pipeline.physics.chain_parameters import chain_parameters
-from cgwm.pipeline.physics.chain_state import with_joints
+from cgwm.pipeline.physics.chains.parameters import chain_parameters
+from cgwm.pipeline.physics.chains.state import with_joints
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.parameters import apply_parameters
 from cgwm.pipeline.physics.world import World

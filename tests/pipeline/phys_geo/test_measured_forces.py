@@ -20,7 +20,7 @@ from cgwm.pipeline.phys_geo.tracks.loss_start import loss_start
 from cgwm.pipeline.phys_geo.tracks.measured_forces import MeasuredForce, force_noise, measured_forces
 from cgwm.pipeline.phys_geo.tracks.multiple_shooting import Shooting, ShootingPrior
 from cgwm.pipeline.physics import Rollout, World
-from cgwm.pipeline.physics.chain_parameters import chain_parameters
+from cgwm.pipeline.physics.chains.parameters import chain_parameters
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import Parameter, contact_parameters
 from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames

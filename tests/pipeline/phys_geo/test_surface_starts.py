@@ -12,10 +12,10 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.phys_geo.stage import CROWDED_SWEEPS, _sweeps
 from cgwm.pipeline.phys_geo.surface_starts import require_outside
 from cgwm.pipeline.physics import Body, World
-from cgwm.pipeline.physics.chain import Chain, Joint
+from cgwm.pipeline.physics.chains.chain import Chain, Joint
 from cgwm.pipeline.physics.contact_detection import Placed
-from cgwm.pipeline.physics.fixed_surface import BOX, CYLINDER, HALF_SPACE, KINDS, FixedSurface
-from cgwm.pipeline.physics.surface_detection import surface_gap
+from cgwm.pipeline.physics.surfaces.detection import surface_gap
+from cgwm.pipeline.physics.surfaces.fixed_surface import BOX, CYLINDER, HALF_SPACE, KINDS, FixedSurface
 from cgwm.schemas import InputDataError
 from helpers.chains import chained, link
 from helpers.fixed_surfaces import surface

@@ -14,7 +14,7 @@ from cgwm.pipeline.physics.contact_law import Touch
 from cgwm.pipeline.physics.hull import _thickness
 from cgwm.pipeline.physics.paper_law import PaperLaw, clamped, creep_speed, paper_impulses, rest_penetration
 from cgwm.pipeline.physics.patch import LEAST_CARRIED, _carried
-from cgwm.pipeline.physics.thin_walls import _after_fall, _half_thickness, _way_through, walls
+from cgwm.pipeline.physics.surfaces.thin_walls import _after_fall, _half_thickness, _way_through, walls
 from cgwm.pipeline.physics.world import pair_of
 from helpers import fixed_surfaces as fixed
 from helpers.worlds import F64, ball_body, batch, box_body, law, plate_body, state_of, times, world_of

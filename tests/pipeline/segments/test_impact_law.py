@@ -18,6 +18,7 @@ from cgwm.pipeline.segments import contact_phases as phases_module
 from cgwm.pipeline.segments.candidates import Candidate, admissible, base_parameters, variants_of, without_effect
 from cgwm.pipeline.segments.center_of_mass import _center_of_mass, _one_body
 from cgwm.pipeline.segments.contact_phases import phases_of
+from cgwm.pipeline.segments.flights.slow_errors import COMMON_S, LIMITS, _timed_forces
 from cgwm.pipeline.segments.impact_law import (
     SLICES,
     Impact,
@@ -37,7 +38,6 @@ from cgwm.pipeline.segments.segments import (
     _windows,
     world_for,
 )
-from cgwm.pipeline.segments.slow_errors import COMMON_S, LIMITS, _timed_forces
 from cgwm.pipeline.trajectories.segmentation import Segment, size_of, whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.diagnosis_data import world_with

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from cgwm.pipeline.segments.repeated_forces import RepeatedForce
-from cgwm.pipeline.segments.restricted_likelihood import LEAST_WHITE, Components
-from cgwm.pipeline.segments.variance_components import _coded  # pyright: ignore[reportPrivateUsage]
+from cgwm.pipeline.segments.flights.repeated_forces import RepeatedForce
+from cgwm.pipeline.segments.flights.restricted_likelihood import LEAST_WHITE, Components
+from cgwm.pipeline.segments.flights.variance_components import _coded  # pyright: ignore[reportPrivateUsage]
 from cgwm.pipeline.trajectories.innovations import CorrelatedNoise
 
 

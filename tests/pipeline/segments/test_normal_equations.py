@@ -11,15 +11,15 @@ import pytest
 import torch
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.parameters import Parameter
-from cgwm.pipeline.segments import variance_components
 from cgwm.pipeline.segments.candidates import Variant
+from cgwm.pipeline.segments.flights import variance_components
+from cgwm.pipeline.segments.flights.repeated_forces import PRIOR_STD, _frames, _held_out, _is_better, _on_path
+from cgwm.pipeline.segments.flights.restricted_likelihood import Scored
+from cgwm.pipeline.segments.flights.variance_components import LONGEST, _climb
 from cgwm.pipeline.segments.held_out_gain import FOLDS, ContactLinearization
 from cgwm.pipeline.segments.linearization import Linearization, _fits, _linearization, eliminate, layout, sums, widths
 from cgwm.pipeline.segments.mixed_model import _factors, _solved
 from cgwm.pipeline.segments.release_detection import _rotation_chi2, without_held
-from cgwm.pipeline.segments.repeated_forces import PRIOR_STD, _frames, _held_out, _is_better, _on_path
-from cgwm.pipeline.segments.restricted_likelihood import Scored
-from cgwm.pipeline.segments.variance_components import LONGEST, _climb
 from cgwm.pipeline.trajectories.correlated_noise import WindowErrors
 from cgwm.pipeline.trajectories.innovations import FALLS, CorrelatedNoise
 from cgwm.pipeline.trajectories.observations import Observations

@@ -12,8 +12,8 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics.world import State
 from cgwm.pipeline.segments import release_detection
-from cgwm.pipeline.segments.bounces import LIMITS as BOUNCE
-from cgwm.pipeline.segments.bounces import BounceSide, _turns, bounces_in
+from cgwm.pipeline.segments.impacts.bounces import LIMITS as BOUNCE
+from cgwm.pipeline.segments.impacts.bounces import BounceSide, _turns, bounces_in
 from cgwm.pipeline.segments.release_detection import LIMITS, _rotation_chi2, held_starts, without_held
 from cgwm.pipeline.segments.segment_states import _merged, _placed, _put, _searched, best_of, costs_of, fit_states
 from cgwm.pipeline.segments.segments import Segments

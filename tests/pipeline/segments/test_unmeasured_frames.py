@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.physics.world import World
-from cgwm.pipeline.segments.bounces import bounces_of
 from cgwm.pipeline.segments.carried_starts import _beginnings, carried_starts
 from cgwm.pipeline.segments.contact_phases import phases_of
 from cgwm.pipeline.segments.described_motion import _Predicted
+from cgwm.pipeline.segments.impacts.bounces import bounces_of
 from cgwm.pipeline.segments.input_checks import _apart, _travel, _turns
-from cgwm.pipeline.segments.sliding_segments import find_sliding_segments
+from cgwm.pipeline.segments.sliding.segments import find_sliding_segments
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.segmentation import (
     Segment,

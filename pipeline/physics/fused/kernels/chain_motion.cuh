@@ -1,5 +1,5 @@
 // How chains move: poses of links, equations of motion (composite bodies, recursive Newton-Euler), servos, limits and dry
-// friction of joints; formulas of `physics/chain_dynamics.py` and `physics/joint_rows.py`.
+// friction of joints; formulas of `physics/chains/dynamics.py` and `physics/chains/joint_rows.py`.
 #if LINKS
 INLINE Vec rotated(Quat q, Vec v) {
     Vec axis = vec(q.x, q.y, q.z), twice = Number(2) * cross(axis, v);

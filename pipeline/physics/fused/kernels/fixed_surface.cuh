@@ -1,6 +1,6 @@
-// Distances of spheres from fixed surfaces; formulas of `physics/fixed_surface.py` and `physics/surface_mesh.py`.
+// Distances of spheres from fixed surfaces; formulas of `physics/surfaces/fixed_surface.py` and `physics/surfaces/surface_mesh.py`.
 #if FIXED
-// A fixed surface: its pose in the kernel's frame, and its size as in `physics/fixed_surface.py`.
+// A fixed surface: its pose in the kernel's frame, and its size as in `physics/surfaces/fixed_surface.py`.
 struct Fixed {
     Vec position, size;
     Mat rotation;
@@ -84,7 +84,7 @@ INLINE Point scaled(Number s, Point a) { Point p = {s * a.x, s * a.y, s * a.z}; 
 INLINE Point point(const Number* at) { Point p = {at[0], at[1], at[2]}; return p; }
 INLINE Point off_side(Point arm, Point side) { return arm - scaled(dot(arm, side) / dot(side, side), side); }
 
-// A triangle mesh as `SurfaceMesh.numbers` and `SurfaceMesh.indices` of `physics/surface_mesh.py` write it.
+// A triangle mesh as `SurfaceMesh.numbers` and `SurfaceMesh.indices` of `physics/surfaces/surface_mesh.py` write it.
 struct TriangleMesh {
     Point low, high;
     Number cell;

@@ -10,8 +10,9 @@ import pytest
 import torch
 from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import Body, Rollout, State, World, simulate
-from cgwm.pipeline.physics.chain import Chain, Joint
-from cgwm.pipeline.physics.chain_state import with_joints
+from cgwm.pipeline.physics.chains.chain import Chain, Joint
+from cgwm.pipeline.physics.chains.joint_command import JointCommand
+from cgwm.pipeline.physics.chains.state import with_joints
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.fused import simulate_fused, structure
@@ -20,7 +21,6 @@ from cgwm.pipeline.physics.fused.packing import pack, reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.structure import SHARED_BYTES, Structure
 from cgwm.pipeline.physics.hull import Hull
-from cgwm.pipeline.physics.joint_command import JointCommand
 from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.runtime import kernel_build
 from cgwm.schemas import UsageError

@@ -1,0 +1,1 @@
+"""Hands: what their controller, plant, runs and films have of their own."""

@@ -1,0 +1,1 @@
+"""Evidence for an effect: score tests, robust fits, cross-validation, consistency, and the selection of one effect."""

@@ -1,0 +1,185 @@
+"""Families of forms that a named force is compared with: when, where, how fast and how spinning a body feels it.
+
+A force may also swing: at so many periods in a usual flight, in one of four phases. A torque that swings does so about
+an axis of the world, since none that a body has of its own is known to any effect.
+
+What a law is least known in is the coordinate that it follows: a drag that is none is likelier to follow the speed in
+another way than to act on one side of the room. Before the data, the families of such coordinates are together as
+likely as all others. Nothing is known that pushes a body in one direction of the world, by how fast it spins.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...physics.effects.effect import ActiveEffect
+from ...segments.flights.force_fields import FlownMotion, ForceField
+from ..thresholds import THRESHOLDS
+from .coupled_effects import DRAGS
+
+LIMITS = THRESHOLDS.forms
+
+UPWARD = ("gravity_scale", "length_scale", "clock_scale")
+"""Effects that change the fall, and nothing across it."""
+OWN_TILTS = ("gravity_tilt", "frame_tilt")
+"""Effects across gravity of which each episode can have its own, which flight does not tell apart."""
+FOLLOWS = {
+    **dict.fromkeys(DRAGS, ("speed",)),
+    "magnus_lift": ("speed", "spin"),
+    "spin_damping": ("spin",),
+    "ground_magnet": ("height",),
+}
+"""Coordinates that the law of an effect follows."""
+OTHER_DRAG = {("linear_drag", 1): "quadratic_drag", ("quadratic_drag", -1): "linear_drag"}
+"""Powers of the speed that make one drag of the library another one."""
+
+
+class Family(NamedTuple):
+    """Forms of a force that differ in one coordinate."""
+
+    coordinate: str
+    """The coordinate."""
+    forms: dict[str, ForceField]
+    """Each by a description in words."""
+    then: str
+    """What to record next to tell them apart."""
+
+
+def own_field(motion: FlownMotion, active: ActiveEffect) -> ForceField | None:
+    """Return the force of an effect along flights, by its parameters; None for what is no force, as an offset."""
+    field, name = motion.field_of(active), active.effect.name
+    if field is not None:
+        return field
+    up, level = motion.axes
+    axes = {**dict.fromkeys(UPWARD, up), **dict.fromkeys(OWN_TILTS, level)}.get(name)
+    if axes is None:
+        return None
+    shape = (*motion.times_s.shape, *axes.shape)
+    return ForceField(axes.expand(shape).clone(), torch.zeros(shape, dtype=torch.float64))
+
+
+def laws_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) -> list[ForceField]:
+    """Return the laws of an effect and of its equals, its own the first: a drag that is not told from the other one.
+
+    Args:
+        motion: The flights.
+        own: The force.
+        named: Names of the effect and of its equals.
+    """
+    size = _in_medians(motion, "speed", motion.velocity_m_s)
+    return [own, *(own.times(size**power) for power in _known_powers(named))]
+
+
+def _known_powers(named: tuple[str, ...]) -> set[int]:
+    """Return the powers of the speed that make the drag of a name that of one of its equals."""
+    return {power for (drag, power), other in OTHER_DRAG.items() if drag in named[:1] and other in named}
+
+
+def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) -> list[Family]:
+    """Return the forms of a force, in families of one coordinate.
+
+    Args:
+        motion: The flights.
+        own: The force.
+        named: Names of the effect and of its equals; what one of these is, is no other form.
+    """
+    same = "the same torque" if bool(own.turning.any()) else "the same force"
+    place = dict(zip(("x", "y", "height"), motion.com_m.unbind(-1), strict=True))
+    level = {**_where(motion, "x", place["x"]), **_where(motion, "y", place["y"])}
+    found = {
+        "time": (_when(motion), "record shorter and longer flights"),
+        "height": (_where(motion, "height", place["height"]), "record lower and higher flights"),
+        "place": (level, "record flights elsewhere"),
+        "speed": (_how_fast(motion, "speed", motion.velocity_m_s, named), "record slower and faster flights"),
+        "spin": (
+            {} if _is_constant(own) else _how_fast(motion, "spin", motion.omega_rad_s),
+            "record flights with less and with more spin",
+        ),
+    }
+    families = [
+        Family(coordinate, {f"{same} {words}": own.times(factor) for words, factor in factors.items()}, then)
+        for coordinate, (factors, then) in found.items()
+    ]
+    return [family for family in (*families, _swinging(motion, own)) if family.forms]
+
+
+def weights_of(families: Sequence[Family], name: str) -> list[float]:
+    """Return how likely each family of other forms of an effect is before the data, in units of the least likely."""
+    own = [family.coordinate in FOLLOWS.get(name, ()) for family in families]
+    near = max(len(own) - sum(own), 1) / max(sum(own), 1)
+    return [near if one else 1.0 for one in own]
+
+
+def _is_constant(field: ForceField) -> bool:
+    """Return whether a force has the same size and direction in the world in all frames, and no torque."""
+    first = field.acceleration[:1, :1]
+    return not bool(field.turning.any()) and bool((field.acceleration - first).abs().max() <= 1e-6 * first.abs().max())
+
+
+def _usual_flight_s(lengths_s: Tensor) -> float:
+    """Return the duration of a usual flight [s] from those of all (B, 1)."""
+    return float(np.quantile(lengths_s[:, 0].numpy(), LIMITS.usual_flight))
+
+
+def _when(motion: FlownMotion) -> Mapping[str, Tensor]:
+    """Return factors of a force that sets in or ends, or does both."""
+    since, left = motion.spans_s
+    usual, found = _usual_flight_s(since + left), {}
+    for share in LIMITS.shares:
+        on = (since > share * usual).double()
+        found |= {f"from {share * usual:.2g} s of a flight on": on, f"until {share * usual:.2g} s of a flight": 1 - on}
+    for first, last in itertools.combinations(LIMITS.shares, 2):
+        on = ((since > first * usual) & (since <= last * usual)).double()
+        found[f"from {first * usual:.2g} to {last * usual:.2g} s of a flight"] = on
+    return found
+
+
+def _swinging(motion: FlownMotion, own: ForceField) -> Family:
+    """Return a force that swings along its own direction, or a torque that does so about an axis of the world."""
+    since, left = motion.spans_s
+    usual, torque = _usual_flight_s(since + left), bool(own.turning.any())
+    if torque:
+        axes = torch.eye(3, dtype=torch.float64).expand(*since.shape, 3, 3)
+        own = ForceField(torch.zeros_like(axes), axes)
+    words = "a torque about one axis of the world" if torque else "the same force"
+    found = {}
+    for periods, phase in itertools.product(LIMITS.periods, LIMITS.phases):
+        swing = torch.sin(math.pi * (2 * periods * since / usual + phase))
+        at = f" in phase {180 * phase:.0f} deg" if phase else ""
+        found[f"{words}, swinging at {periods / usual:.2g} Hz{at}"] = own.times(swing)
+    return Family("swinging", found, "record longer flights")
+
+
+def _where(motion: FlownMotion, name: str, values: Tensor) -> Mapping[str, Tensor]:
+    """Return factors of a force that acts on one side of a place, or grows with it."""
+    edge = motion.median(values)
+    on = (values > edge).double()
+    words = {f"where {name} is above {edge:.2g} m": on, f"where {name} is below {edge:.2g} m": 1 - on}
+    return {**words, f"times {name}": values}
+
+
+def _how_fast(motion: FlownMotion, name: str, vectors: Tensor, named: tuple[str, ...] = ()) -> Mapping[str, Tensor]:
+    """Return factors of a force by other powers of speed or spin, or on one side of it; none where it has no spread."""
+    plain, size = vectors.norm(dim=-1), _in_medians(motion, name, vectors)
+    if not bool((size[motion.inside] - 1).abs().max() > 1e-6):
+        return {}
+    known = _known_powers(named)
+    found = {f"times the {name} to the power {power}": size**power for power in LIMITS.powers if power not in known}
+    for edge in torch.quantile(plain[motion.inside], torch.tensor(LIMITS.edges, dtype=plain.dtype)).tolist():
+        on = (plain > edge).double()
+        words = f"{edge:.2g} {'m/s' if name == 'speed' else 'rad/s'} alone"
+        found |= {f"where the {name} is above {words}": on, f"where the {name} is below {words}": 1 - on}
+    return found
+
+
+def _in_medians(motion: FlownMotion, name: str, vectors: Tensor) -> Tensor:
+    """Return speeds or spins (B, T) in their median, the slowest taken as those of which the direction is known."""
+    size = vectors.norm(dim=-1).clamp_min(LIMITS.slowest[name == "spin"])
+    return size / motion.median(size)

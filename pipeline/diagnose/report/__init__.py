@@ -1,0 +1,1 @@
+"""The verdict in words, on a page and as the next command."""

@@ -1,0 +1,1 @@
+"""Jointed bodies: links in a tree, their motion, and the rows of their joints in the contact solver."""

@@ -1,0 +1,1 @@
+"""Flights: their slow errors, what repeats in them, and the residual wrench that they show."""

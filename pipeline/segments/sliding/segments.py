@@ -1,0 +1,182 @@
+"""Sliding segments: a body stays on the ground without an impact, sliding, rolling or spinning.
+
+There the normal force is the weight whatever the contact law, so that engines that differ widely in an impact agree,
+and the information about a friction grows with the fourth power of the time as in flight. So sliding segments are cut
+long, while other contacts are cut short.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from ...physics.impulse_solver import tangent_axes
+from ...physics.world import State, World
+from ...trajectories.observations import Observations
+from ...trajectories.segmentation import GroundPlane, Segment, heights_of, size_of, without_rest
+from ...trajectories.thresholds import TRACK_THRESHOLDS
+from ...trajectories.track_noise import Noise
+from ..contact_phases import is_round
+from ..segments import Segments
+from ..thresholds import SEGMENT_THRESHOLDS
+
+LIMITS = SEGMENT_THRESHOLDS.sliding_data
+
+Array = NDArray[np.float64]
+
+SIDE_S, SIDE_FRAMES = 0.04, 3
+"""Time [s] and minimum number of frames on both sides over which a jump of a velocity is measured."""
+
+
+def find_sliding_segments(world: World, whole: Observations, clear: Tensor, noise: Noise) -> list[Segment]:
+    """Return the sliding segments of whole episodes; none without a ground or with several bodies.
+
+    Args:
+        world: For shape and ground.
+        whole: The episodes (E).
+        clear: Airborne frames (E, T).
+        noise: Standard deviations of the tracks (position [m], rotation [rad]).
+    """
+    if world.ground_normal is None or len(whole.free) != 1 or len(world.bodies) != 1:
+        return []
+    body = world.bodies[whole.free[0]]
+    margin = LIMITS.near_m + LIMITS.near_sigmas * float(np.hypot(noise.position_m, noise.rotation_rad * size_of(body)))
+    lowest = heights_of(world, body, whole, 0).amin(-1)
+    on = (lowest < margin) & ~clear & (whole.seen[:, :, 0] > 0)
+    found = []
+    for episode, times in enumerate(whole.times_s):
+        seen = (whole.seen[episode].amax(-1) > 0).nonzero()[:, 0]  # any frame may be hidden, the first included
+        if len(seen) < 2:
+            continue
+        near = on[episode, seen].numpy()
+        if not near.any():
+            continue
+        steady = near & ~_impacts(world, whole, episode, seen, noise, near)
+        if not is_round(body):
+            steady &= ~_tilting(world, whole, episode, seen, noise.rotation_rad, near)
+        parts = _parts(times[seen].numpy(), steady)
+        found += [Segment(episode, int(seen[first]), int(seen[last])) for first, last in parts]
+    return without_rest(whole, found, noise)
+
+
+def grounded_states(segments: Segments, state: State) -> State:
+    """Return states with the body on the ground in its mean orientation, without speed along the normal."""
+    seen, world = segments.observations, segments.world
+    (normal, offset), index = GroundPlane.of(world), seen.free[0]
+    fields = [value.clone() for value in state.tensors]
+    weight = seen.has_orientation[:, :, 0, None]
+    up = quat_to_matrix(seen.quat_wxyz[:, :, 0]).transpose(-1, -2) @ normal
+    up = torch.nn.functional.normalize((up * weight).sum(1), dim=-1)
+    now = quat_to_matrix(fields[1][:, index]).transpose(-1, -2) @ normal
+    # the shortest turn, in body axes, that brings the mean direction of the normal to where it is now
+    turn = torch.cat((1 + (up * now).sum(-1, keepdim=True), torch.linalg.cross(up, now)), -1)
+    fields[1][:, index] = quat_multiply(fields[1][:, index], torch.nn.functional.normalize(turn, dim=-1))
+    body = world.bodies[index]
+    chosen = slice(None) if body.on_plane is None else body.on_plane
+    along = quat_to_matrix(fields[1][:, index]).transpose(-1, -2) @ normal
+    low = (fields[0][:, index] @ normal - offset[0])[:, None] + along @ body.centers[0, chosen].T
+    low = (low - body.radii[0, chosen]).amin(-1)
+    fields[0][:, index] -= low[:, None] * normal
+    fields[2][:, index] -= (fields[2][:, index] @ normal)[:, None] * normal
+    return State(*fields)
+
+
+def _impacts(
+    world: World, whole: Observations, episode: int, seen: Tensor, noise: Noise, asked: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return which of the asked frames are within one frame of a jump of the speed along the normal, or of the tilting.
+
+    Args:
+        world: For shape and ground.
+        whole: The episodes.
+        episode: Index of the episode.
+        seen: Indices of its seen frames.
+        noise: Standard deviations of the tracks.
+        asked: Which of the seen frames are asked for; the answer for others means nothing.
+    """
+    body, normal = world.bodies[whole.free[0]], GroundPlane.of(world).normal
+    height = (whole.position_m[episode, seen, 0] @ normal).numpy()
+    quat, turned = whole.quat_wxyz[episode, seen, 0], whole.has_orientation[episode, seen, 0].numpy() > 0
+    level = tangent_axes(normal)[1:]
+    jumps = np.zeros(len(seen), np.bool_)
+    for places, frames, t in _windows(whole.times_s[episode, seen].numpy(), _beside(asked)):
+        inverse = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2, np.maximum(t, 0.0)], -1))[:, 3]
+        spread = np.linalg.norm(inverse, axis=1)
+        least = np.maximum(LIMITS.jump_m_s, LIMITS.jump_sigmas * noise.position_m * spread)
+        found = np.abs((inverse * height[frames]).sum(1)) > least
+        known = turned[frames].all(1)
+        if not is_round(body) and known.any():  # an impact of a ball never changes its spin alone
+            now = quat_conjugate(quat[torch.from_numpy(places)])[:, None]
+            turns = quat_log(quat_multiply(quat[torch.from_numpy(frames)], now))  # world axes
+            tilting = np.linalg.norm(np.einsum("nw,nwa->na", inverse, (turns @ level.T).numpy()), axis=1)
+            least = np.maximum(LIMITS.jump_m_s / size_of(body), LIMITS.jump_sigmas * noise.rotation_rad * spread)
+            found |= known & (tilting > least)
+        jumps[places] = found & ((t < 0).sum(1) >= 2) & ((t > 0).sum(1) >= 2)
+    return _beside(jumps)
+
+
+def _beside(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the chosen frames and those next to one."""
+    wide = chosen.copy()
+    wide[1:] |= chosen[:-1]
+    wide[:-1] |= chosen[1:]
+    return wide
+
+
+def _tilting(
+    world: World, whole: Observations, episode: int, seen: Tensor, noise_rad: float, asked: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return at which of the asked frames the body does not stay on one of its sides; arguments as of `_impacts`."""
+    normal = GroundPlane.of(world).normal
+    turned = whole.has_orientation[episode, seen, 0].numpy() > 0
+    up = (quat_to_matrix(whole.quat_wxyz[episode, seen, 0]).transpose(-1, -2) @ normal).numpy()
+    tilts = np.zeros(len(seen), np.bool_)
+    for places, frames, t in _windows(whole.times_s[episode, seen].numpy(), asked):
+        known = turned[frames]
+        # a frame that does not count is a row of zeros
+        slope = np.linalg.pinv(np.stack([np.ones_like(t), t], -1) * known[..., None])[:, 1]
+        least = np.maximum(LIMITS.tilting_rad_s, LIMITS.jump_sigmas * noise_rad * np.linalg.norm(slope, axis=1))
+        tilting = np.linalg.norm(np.einsum("nw,nwa->na", slope, up[frames]), axis=1)
+        tilts[places] = (known.sum(1) >= 3) & (tilting > least)
+    return tilts
+
+
+def _windows(times: Array, asked: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
+    """Yield asked frames (n,), those within some steps of each (n, w), and their distance (n, w) [s].
+
+    Frames with as many others near them come together.
+
+    Args:
+        times: Of the frames, at least two [s].
+        asked: Which of them are asked for.
+    """
+    step = float(np.median(np.diff(times)))
+    side = max(SIDE_FRAMES, round(SIDE_S / step))
+    reach = (side + 0.5) * step
+    firsts, ends = np.searchsorted(times, times - reach), np.searchsorted(times, times + reach)
+    for width in np.unique((ends - firsts)[asked]).tolist():
+        places = np.flatnonzero((ends - firsts == width) & asked)
+        frames = firsts[places, None] + np.arange(width)
+        yield places, frames, times[frames] - times[places, None]
+
+
+def _parts(times: Array, steady: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last frames of the steady stretches that are long enough, cut into equal parts."""
+    found: list[tuple[int, int]] = []
+    steps = np.diff(times)
+    breaks = np.append(False, steps > TRACK_THRESHOLDS.segmentation.gap * np.median(steps))
+    edges = np.flatnonzero(np.append(True, (steady[1:] != steady[:-1]) | breaks[1:]))
+    for first, end in itertools.pairwise([*edges.tolist(), len(times)]):
+        length = times[end - 1] - times[first]
+        if not steady[first] or length < LIMITS.shortest_s:
+            continue
+        number = int(np.ceil(length / LIMITS.longest_s - 1e-9))
+        cuts = [first + round(k * (end - 1 - first) / number) for k in range(number + 1)]
+        found += itertools.pairwise(cuts)
+    return found

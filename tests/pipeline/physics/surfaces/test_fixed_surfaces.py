@@ -1,0 +1,178 @@
+"""Fixed surfaces: exact distances, contacts with meshes, and rolling without falling through."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cgwm.pipeline.physics import engine, simulate
+from cgwm.pipeline.physics.contact_detection import Placed
+from cgwm.pipeline.physics.surfaces.detection import all_surface_points
+from cgwm.pipeline.physics.surfaces.fixed_surface import FixedSurface
+from cgwm.pipeline.physics.surfaces.surface_mesh import _closest
+from cgwm.schemas import InputDataError
+from helpers import fixed_surfaces as fixed
+from helpers.worlds import F64, ball_body, law, state_of, times, world_of
+
+LEVEL = ((1, 0, 0, 0), (0, 0, 0), (0, 0, 0))
+
+
+def contacts(surface: FixedSurface, centers: list, radius: float = 0.02) -> list[list[tuple[float, list[float]]]]:
+    """Return gaps and normals of the contacts of balls."""
+    place = torch.tensor(centers, dtype=F64)
+    zero = torch.zeros_like(place)
+    placed = Placed(ball_body(radius), place, torch.eye(3, dtype=F64).expand(len(place), 3, 3), zero, zero)
+    points = all_surface_points(placed, surface)
+    return [
+        [(float(g), n.tolist()) for g, n in zip(gaps, normals, strict=True) if g < 1]
+        for gaps, normals in zip(points.gap, points.normal, strict=True)
+    ]
+
+
+BOX = fixed.box((0.1, 0.2, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("surface", "at", "distance", "normal"),
+    [
+        (fixed.half_space(position=(0, 0, 0.1)), (5, 3, 0.4), 0.3, (0, 0, 1)),
+        (BOX, (0.25, 0, 0), 0.15, (1, 0, 0)),
+        (BOX, (0.13, -0.24, 0), 0.05, (0.6, -0.8, 0)),  # an edge
+        (BOX, (0.12, 0.22, 0.31), 0.03, (2 / 3, 2 / 3, 1 / 3)),  # a corner
+        (BOX, (-0.09, 0.01, 0), -0.01, (-1, 0, 0)),  # the shortest way out
+        (fixed.box((0.1, 0.2, 0)), (0.05, 0.1, -0.04), 0.04, (0, 0, -1)),  # a sheet, from below
+        (fixed.box((0.1, 0.2, 0)), (0.13, 0, 0.04), 0.05, (0.6, 0, 0.8)),
+        (fixed.cylinder(0.1, 0.3), (0.09, 0.12, 0.1), 0.05, (0.6, 0.8, 0)),
+        (fixed.cylinder(0.1, 0.3), (0.0, 0.05, 0.35), 0.05, (0, 0, 1)),
+        (fixed.cylinder(0.1, 0.3), (0.0, 0.13, -0.34), 0.05, (0, 0.6, -0.8)),  # the rim
+        (fixed.cylinder(0.1, 0.3), (-0.08, 0, 0), -0.02, (-1, 0, 0)),
+        (fixed.cylinder(0.1, 0.3), (0, 0, 0.28), -0.02, (0, 0, 1)),
+        (fixed.box((0.1, 0.2, 0.3), quat=fixed.turn((0, 0, 1), 90)), (0.0, 0.15, 0), 0.05, (0, 1, 0)),
+    ],
+)
+def test_distances_to_shapes_are_exact(surface: FixedSurface, at: tuple, distance: float, normal: tuple) -> None:
+    ((gap, found),) = contacts(surface, [at])[0]
+    assert gap == pytest.approx(distance - 0.02, abs=1e-14)
+    assert found == pytest.approx(normal, abs=1e-12)
+
+
+def test_a_closed_mesh_of_a_box_is_that_box() -> None:
+    half = (0.1, 0.2, 0.3)
+    vertices, faces = fixed.box_mesh(half)
+    mesh, exact = fixed.mesh_surface(vertices, faces, solid=True), fixed.box(half)
+    places = (np.random.default_rng(2).uniform(-1.2, 1.2, (400, 3)) * half).tolist()
+    near = 0
+    for at, of_mesh, of_box in zip(places, contacts(mesh, places), contacts(exact, places), strict=True):
+        ((gap, normal),) = of_box
+        if -0.08 < gap + 0.02 < 0.06:  # within the cells about the surface
+            near += 1
+            ((found, direction),) = of_mesh
+            assert found == pytest.approx(gap, abs=1e-12), at
+            assert direction == pytest.approx(normal, abs=1e-9), at
+    assert near > 150
+
+
+def test_contacts_of_a_mesh_are_the_minima_of_the_distance() -> None:
+    groove = fixed.mesh_surface(*fixed.groove())
+    s = math.sqrt(0.5)
+    grid = np.linspace(-0.04, 1.0, 40)  # over inner edges, corners and triangles
+    for found in contacts(groove, [(x, 0.003, 0.02) for x in grid]):
+        assert sorted(normal[1] for _, normal in found) == pytest.approx([-s, s])
+        assert sorted(gap for gap, _ in found) == pytest.approx([s * (0.02 - 0.003) - 0.02, s * 0.023 - 0.02])
+    below = contacts(groove, [(x, 0.0, -0.01) for x in grid])  # from the other side, its keel is one convex edge
+    assert all(len(found) == 1 and found[0] == (pytest.approx(-0.01), pytest.approx([0, 0, -1])) for found in below)
+
+
+def test_a_corner_of_three_walls_has_three_contacts_and_the_tip_one() -> None:
+    vertices = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    corner = fixed.mesh_surface(vertices, [(0, 1, 2), (0, 2, 3), (0, 3, 1)])
+    inner, outer = contacts(corner, [(0.015, 0.016, 0.017), (-0.01, -0.01, -0.005)])
+    assert sorted(gap for gap, _ in inner) == pytest.approx([-0.005, -0.004, -0.003])
+    assert [(gap, normal) for gap, normal in outer] == [
+        (pytest.approx(-0.005), pytest.approx([-2 / 3, -2 / 3, -1 / 3]))
+    ]
+
+
+def test_a_height_field_is_solid_below() -> None:
+    vertices = [(x, y, 0.0) for x in (0, 1) for y in (0, 1)]
+    sheet = fixed.mesh_surface(vertices, [(0, 2, 3), (0, 3, 1)], solid=True)
+    found = contacts(sheet, [(0.4, 0.5, 0.01), (0.4, 0.5, -0.3)])
+    assert [[gap for gap, _ in one] for one in found] == [[pytest.approx(-0.01)], [pytest.approx(-0.32)]]
+    assert all(one[0][1] == [0, 0, 1] for one in found)
+
+
+def test_degenerate_triangles_are_refused() -> None:
+    with pytest.raises(InputDataError, match="mesh: 1 of 1 triangles are degenerate, the first at"):
+        fixed.mesh_surface([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2)])
+
+
+@pytest.mark.parametrize("kind", [pytest.param("planes", marks=pytest.mark.evidence), "mesh"])
+def test_a_ball_rolls_down_a_groove_at_the_analytic_acceleration(kind: str) -> None:
+    """Rolling about the line between two contacts at r / sqrt(2): a = g sin / (1 + 2/5 r^2 / (r^2 / 2))."""
+    slope, radius = 10.0, 0.02
+    tilt = fixed.turn((0, 1, 0), slope)
+    if kind == "mesh":
+        surfaces = (fixed.mesh_surface(*fixed.groove(), quat=tilt),)
+    else:
+        turns = [fixed.times_turn(tilt, fixed.turn((1, 0, 0), degrees)) for degrees in (-45, 45)]
+        surfaces = tuple(fixed.half_space(f"side{k}", quat=quat) for k, quat in enumerate(turns))
+    world = replace(world_of(ball_body(radius), contact=law(0.5), ground=False), surfaces=surfaces)
+    sine, cosine = math.sin(math.radians(slope)), math.cos(math.radians(slope))
+    height = radius * math.sqrt(2)
+    state = state_of(((height * sine, 0, height * cosine), *LEVEL))
+    time = times(1.4, 10)
+    with torch.no_grad():
+        found = engine.rollout(world, state, time)
+    down = torch.tensor([cosine, 0, -sine], dtype=F64)
+    speed = found.velocity_m_s[0, :, 0] @ down
+    assert float(speed[-1] - speed[4]) == pytest.approx(9.81 * sine / 1.8 * float(time[-1] - time[4]), rel=1e-6)
+    up = found.position_m[0, :, 0] @ torch.tensor([sine, 0, cosine], dtype=F64)
+    assert float((up - height).abs().max()) < 5e-4
+    assert float(found.position_m[0, -1, 0] @ down) > 0.9
+
+
+def test_momentum_labels_hold_in_a_box_of_walls() -> None:
+    """The impulses of the contacts, with that of gravity, are the change of momentum."""
+    vertices, faces = fixed.groove(0.2, 4)
+    surfaces = (fixed.mesh_surface(vertices, faces), fixed.box((0.01, 0.2, 0.2), position=(0.06, 0, 0)))
+    world = replace(world_of(ball_body(0.02), contact=law(0.3), ground=False), surfaces=surfaces)
+    state = state_of(((0, 0.01, 0.06), (1, 0, 0, 0), (0.4, 0.1, 0), (0, 1, 0)))
+    with torch.no_grad():
+        found = simulate(world, state, times(0.25, 20), record_contacts=True)
+    assert found.contacts is not None
+    change = 0.2 * found.velocity_m_s[0, :, 0].diff(dim=0) - 0.05 * 0.2 * world.gravity
+    impulse = found.contacts.impulse_n_s[0, 1:].sum(1)
+    torch.testing.assert_close(impulse, change, rtol=0, atol=1e-12)
+    acted = found.contacts.impulse_n_s[0].norm(dim=-1) > 0
+    assert {int(b) for b, yes in zip(found.contacts.body_b, acted.any(0), strict=True) if yes} == {-2, -3}
+    along = (found.contacts.impulse_n_s * found.contacts.normal).sum(-1)[0][acted]
+    assert float((along / found.contacts.impulse_n_s[0].norm(dim=-1)[acted]).min()) > 0.9 / math.sqrt(1.09)
+
+
+def test_a_ball_far_from_all_surfaces_flies() -> None:
+    surfaces = (fixed.mesh_surface(*fixed.groove()), fixed.box((0.1, 0.1, 0.1)), fixed.cylinder(0.1, 0.1))
+    world = replace(world_of(ball_body(), ground=False), surfaces=surfaces)
+    state = state_of(((0, 0, 5.0), *LEVEL))
+    free = replace(world, surfaces=())
+    with torch.no_grad():
+        found, expected = (simulate(one, state, times(0.1, 20)) for one in (world, free))
+    assert torch.equal(found.position_m, expected.position_m)
+
+
+def test_the_nearest_place_of_a_triangle_is_on_it_and_nothing_of_it_is_nearer() -> None:
+    generator = torch.Generator().manual_seed(0)
+    corners = torch.randn(4, 3, 3, generator=generator, dtype=F64)
+    points = 2 * torch.randn(60, 3, generator=generator, dtype=F64)
+    offset, region = _closest(points, corners)
+    assert set(region.flatten().tolist()) == set(range(7))
+    foot = points[:, None] - offset
+    weights = torch.linalg.solve(corners.mT, foot[..., None])[..., 0]  # of the corners
+    assert float(weights.min()) > -1e-9
+    torch.testing.assert_close(weights.sum(-1), torch.ones(60, 4, dtype=F64))
+    first, second = torch.rand(2, 400, generator=generator, dtype=F64)
+    shares = torch.stack((1 - first.sqrt(), first.sqrt() * (1 - second), first.sqrt() * second), -1)
+    others = (points[:, None, None] - shares @ corners).norm(dim=-1).amin(-1)
+    assert bool((offset.norm(dim=-1) <= others + 1e-12).all())
