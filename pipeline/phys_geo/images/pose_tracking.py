@@ -40,6 +40,9 @@ ALARM_IOU = 0.8
 """Overlap of the best pose with the masks below which all orientations are tried again."""
 MIN_FOUND = 0.5
 """Minimum share of the instants in which the bodies must be found."""
+MAX_SPREAD = 2.0
+"""Ratio of the standard deviation of a place to the median over the instants above which the body counts as not found
+there: tracks have one noise, and where a second camera sees little of the body the first one tells no depth."""
 CORRELATED_PX = 5.0
 """Side of the squares over which errors of shape, shading and colour are correlated [px]. Chosen on one built-in scene,
 where it makes the standard deviations about as large as the errors of the poses."""
@@ -89,6 +92,17 @@ def pose_noise(tracks: Sequence[PoseTrack]) -> Noise:
     """
     std = torch.cat([track.variance for track in tracks]).median(0).values.mean((0, 2)).sqrt()
     return Noise(float(std[0]), float(std[1]))
+
+
+def well_placed(covariance: Tensor, found: Tensor) -> Tensor:
+    """Return whether the places of all free bodies are about as certain as in most instants, shape (I,).
+
+    Args:
+        covariance: Covariances of the free bodies' poses, as in `PoseTrack`.
+        found: Whether the bodies were found, shape (I,).
+    """
+    places = covariance.diagonal(dim1=1, dim2=2).unflatten(1, (-1, 2, 3))[:, :, 0].sum(-1).sqrt()
+    return (places <= MAX_SPREAD * places[found].median(0).values).all(1)
 
 
 def track_state(track: PoseTrack) -> dict[str, object]:
@@ -165,14 +179,16 @@ class PoseTracker:
         found = quality.found & seen.to(quality.found.device)
         if float(found.float().mean()) < MIN_FOUND:
             raise NotConvergedError(self._failure(quality, found), todo=_TODO)
+        covariance = self._covariance(model.curvature, quality).double().cpu()
+        found = found.cpu() & well_placed(covariance, found.cpu())
         return PoseTrack(
             position_m=self._position.double().cpu(),
             quat_wxyz=self._quat.double().cpu(),
             curvature=model.curvature.double().cpu(),
-            covariance=self._covariance(model.curvature, quality).double().cpu(),
+            covariance=covariance,
             loss=model.value.cpu(),
             quality=PoseQuality(*(getattr(quality, name).cpu() for name in quality.__dataclass_fields__)),
-            found=found.cpu(),
+            found=found,
             searches=self._searches,
             rival_nats=rival,
         )

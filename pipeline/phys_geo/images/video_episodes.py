@@ -250,7 +250,10 @@ def track_warnings(episodes: Sequence[VideoEpisode]) -> list[str]:
             continue
         lost = int((~episode.found.found).sum())
         if lost:
-            texts.append(f"{episode.name}: the body was not found in {lost} of {len(episode.found.found)} instants.")
+            texts.append(
+                f"{episode.name}: the body was not found, or could hardly be placed, in {lost} of "
+                f"{len(episode.found.found)} instants; these are left out."
+            )
         if episode.found.rival_nats < RIVAL_NATS:
             texts.append(
                 f"{episode.name}: another history of poses, from another orientation, explains the frames about as "

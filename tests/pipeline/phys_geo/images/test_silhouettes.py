@@ -14,7 +14,7 @@ from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.geometry.primitives import shape_mesh
 from cgwm.pipeline.geometry.rotation import geodesic_angle, matrix_to_quat, quat_exp, quat_multiply, quat_to_matrix
 from cgwm.pipeline.phys_geo.images.crops import Window
-from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTracker
+from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTracker, well_placed
 from cgwm.pipeline.phys_geo.images.silhouette_loss import SilhouetteLoss, image_loss
 from cgwm.pipeline.phys_geo.images.silhouettes import Outline, body_outlines, covered
 from cgwm.pipeline.phys_geo.images.video_frames import Footage, Video, load_footage
@@ -147,6 +147,15 @@ def test_poses_are_found_from_masks_alone(tmp_path: Path, cameras: int) -> None:
     truth, blank = loss.values(torch.arange(FRAMES), position, quat), loss.quality(torch.arange(FRAMES), position, quat)
     assert float(truth.max()) < 0.02 and bool(blank.found.all())
     assert float(loss.parts(torch.arange(FRAMES), position, quat)[:, 0].abs().max()) == 0.0
+
+
+def test_instants_whose_place_is_far_less_certain_than_that_of_others_are_left_out() -> None:
+    std_m = torch.tensor([4.0, 1.9, 1.0, 1.0, 0.8, 9.0, 9.0])
+    found = torch.tensor([True, True, True, True, True, False, False])
+    covariance = torch.eye(6, dtype=F64) * 100.0  # a ball's rotation is never certain
+    covariance = covariance.repeat(len(std_m), 1, 1)
+    covariance[:, :3, :3] = torch.eye(3, dtype=F64) * std_m[:, None, None] ** 2
+    assert well_placed(covariance, found).tolist() == [False, True, True, True, True, False, False]
 
 
 def _same_cubes(quat: torch.Tensor) -> list[torch.Tensor]:
