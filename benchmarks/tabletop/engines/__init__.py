@@ -32,6 +32,7 @@ class Entry:
 
 ENGINES: dict[str, Entry] = {
     "mujoco": Entry(mujoco_engine.Coulomb, "mujoco"),
+    "mujoco_pyramid": Entry(mujoco_engine.Pyramid, "mujoco"),
     "mujoco_default": Entry(mujoco_engine.Default, "mujoco"),
     "drake": Entry(drake_engine.Drake, "pydrake"),
     "dart": Entry(dart_engine.Dart, "dartpy", any_solid=False),
@@ -39,8 +40,10 @@ ENGINES: dict[str, Entry] = {
     "cgwm": Entry(own_engine.Own, "torch"),
 }
 """By name; `mujoco` is the truth of the older tables."""
-JUDGES = tuple(name for name in ENGINES if name != "cgwm")
-"""The engines that are not cgwm's own, which only an error budget takes as the truth."""
+PARTS = ("cgwm", "mujoco_pyramid")
+"""cgwm's own, which only an error budget takes as the truth, and what differs from another by one part of its law."""
+JUDGES = tuple(name for name in ENGINES if name not in PARTS)
+"""The engines that judge."""
 
 
 def refusal(name: str, solid: SolidObject) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from cgwm.datasets.synthetic.dynamics import (
@@ -30,8 +31,21 @@ class Coulomb:
         self, qpos: Array, qvel: Array, start: float, end: float, command: tuple[Array, Array] | None = None
     ) -> Motion:
         """See `Engine`."""
-        model = build_model(self.solid, self.contact, self.fingertip)
-        return simulate(model, qpos, qvel, start, end, command)
+        return simulate(self.model(), qpos, qvel, start, end, command)
+
+    def model(self) -> Any:
+        """Return MuJoCo's model of the scene."""
+        return build_model(self.solid, self.contact, self.fingertip)
+
+
+class Pyramid(Coulomb):
+    """The same with a pyramid in place of Coulomb's cone: how much of a floor the direction of friction makes."""
+
+    def model(self) -> Any:
+        """See `Coulomb`."""
+        model = super().model()
+        model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+        return model
 
 
 class Default(Stepping):
