@@ -73,8 +73,9 @@ def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres 
     visual = None
     if world is not None and solid is not None:
         visual = world.moved(_tensor(T_body_world, stage.device)).to_numpy()
-        nearest = KDTree(solid.surface).query(world.means.cpu().numpy())[1]
-        visual = replace(visual, normals=solid.normals[nearest] @ T_body_world[:3, :3].T)
+        outside = solid if felt is None else felt  # flat faces have the normals of their planes
+        nearest = KDTree(outside.surface).query(world.means.cpu().numpy())[1]
+        visual = replace(visual, normals=outside.normals[nearest] @ T_body_world[:3, :3].T)
         if stage.config.collision == "visual":
             collision = visual
             distance = float(_union(visual, stage.config).distance(_moved(solid, T_body_world).surface).max())
