@@ -136,7 +136,7 @@ def budget(videos: VideoErrors, scene: TrueScene, prediction: EpisodePrediction,
         ("true_light_at_true", lit, true),
     ):
         pictures, labels = errors._render(footage, camera, motion, at)
-        drawn[kind] = expose(pictures, exposure), labels
+        drawn[kind] = expose(errors._blurred(footage, camera, motion, prediction.grid_s, pictures), exposure), labels
         decibels[kind] = videos._ratios(footage, drawn[kind][0], labels > 0)[1].tolist()
     frames = videos.capture.video_frames(camera, prediction.episode)
     parts: dict[str, float] = defaultdict(float)

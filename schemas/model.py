@@ -219,6 +219,8 @@ class Exposure(FileModel):
 
     gain_rgb: tuple[PositiveGain, PositiveGain, PositiveGain] = (1.0, 1.0, 1.0)
     offset_rgb: Colour3 = (0.0, 0.0, 0.0)
+    duration_s: float = Field(default=0.0, ge=0)
+    """How long a frame is exposed, about its time [s]; 0 is an instant, or too little motion to tell."""
 
 
 class Light(FileModel):

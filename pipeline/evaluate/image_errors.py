@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from ...datasets.models.model import Model
 from ...schemas import Exposure
 from ..rendering.image_metrics import ssim_map
 from ..rendering.label_renderer import LabelRenderer
+from ..rendering.motion_blur import exposed_for, poses_at
 from ..rendering.video_view import expose, video_view
 from .prediction import MODEL, EpisodePrediction, Motion
 from .silhouette_errors import SilhouetteErrors, silhouette_errors
@@ -97,16 +99,16 @@ class VideoErrors:
         object_psnr: dict[str, Array] = {}
         ssim: dict[str, Array] = {}
         silhouettes: dict[str, SilhouetteErrors] = {}
-        shown: Image | None = None
+        kept: Image | None = None
         for method, motion in prediction.motions.items():
-            pictures, labels = self._render(footage, camera, motion, at)
-            exposed = expose(pictures, exposure)
+            shown, labels = self._render(footage, camera, motion, at)
+            exposed = expose(self._blurred(footage, camera, motion, prediction.grid_s, shown), exposure)
             psnr[method], object_psnr[method] = self._ratios(footage, exposed, labels > 0)
             ssim[method] = self._similarities(footage, exposed)
             if footage.objects is not None:
                 silhouettes[method] = silhouette_errors(footage.objects, labels, footage.valid, len(prediction.bodies))
             if method == MODEL and self.keep_frames:
-                shown = (exposed * 255).round().astype(np.uint8)
+                kept = (exposed * 255).round().astype(np.uint8)
         real = footage.images if self.keep_frames else None
         known = footage.objects is not None
         return VideoComparison(
@@ -119,7 +121,7 @@ class VideoErrors:
             cameras=footage.cameras,
             true_masks=known,
             real=real,
-            predicted=shown,
+            predicted=kept,
         )
 
     def _footage(self, prediction: EpisodePrediction, camera: str) -> _Footage | None:
@@ -164,6 +166,20 @@ class VideoErrors:
             same = place.ravel() == key
             pictures[same], masks[same] = block.image[0], _numbered(block.mask[0], free)
         return pictures, masks
+
+    def _blurred(
+        self, footage: _Footage, name: str, motion: Motion, grid_s: Array, shown: Image
+    ) -> NDArray[np.float32]:
+        """Return pictures (F, H, W, 3) of the bodies over the exposures of the camera, 0 to 255."""
+
+        def draw(rows: NDArray[np.intp], position_m: Array, quat_wxyz: Array) -> Image:
+            cameras = [footage.cameras[k] for k in rows]
+            some = replace(footage, images=footage.images[rows], cameras=cameras)
+            return self._render(some, name, Motion(position_m, quat_wxyz), np.arange(len(rows)))[0]
+
+        duration_s = self.model.file.exposures.get(name, Exposure()).duration_s
+        poses = partial(poses_at, grid_s, motion.position_m, motion.quat_wxyz)
+        return exposed_for(duration_s, draw, shown, poses, footage.time_s)
 
     def _renderer(self, name: str, camera: Camera) -> LabelRenderer:
         key = camera.T_world_cam.tobytes() + camera.K.tobytes() + bytes(f"{camera.width}x{camera.height}", "ascii")

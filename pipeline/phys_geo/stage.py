@@ -219,14 +219,15 @@ def _video_s(capture: Capture, episode: str) -> float:
 
 def _with_appearance(model: Model, capture: Capture, split: str, config: PhysConfig, found: PhysicsFit) -> Model:
     """Return the model with the exposure of the video cameras and the light on the bodies."""
+    from .images.exposure_time import with_durations
     from .images.lighting_fit import learn_appearance
     from .images.video_exposure import estimate_exposures
 
     note("phys-geo: exposure and light")
     exposures = estimate_exposures(model, capture, split, config.device)
     model = replace(model, file=model.file.model_copy(update={"exposures": exposures}))
-    # with images alone measured tracks are not used
-    return learn_appearance(model, capture, exposures, split, found.tracks if config.supervise == "images" else None)
+    tracks = found.tracks if config.supervise == "images" else None  # measured ones are not used then
+    return with_durations(learn_appearance(model, capture, exposures, split, tracks), capture, split, tracks)
 
 
 def _with_collision(model: Model, moved: Mapping[str, Splats]) -> Model:

@@ -30,8 +30,8 @@ def video_view(capture: Capture, camera: str, episode: str, frame: int, size: tu
     return view if (view.width, view.height) == tuple(size) else view.resized(*size)
 
 
-def expose(pictures: Image, exposure: Exposure) -> NDArray[np.float32]:
-    """Apply a camera's exposure to the model's colours: gain * colour + offset, clipped to [0, 1]."""
+def expose(pictures: Image | NDArray[np.float32], exposure: Exposure) -> NDArray[np.float32]:
+    """Apply a camera's gain and offset to the model's colours, 0 to 255; the result is clipped to [0, 1]."""
     gain, offset = (np.asarray(values, np.float32) for values in (exposure.gain_rgb, exposure.offset_rgb))
     return np.clip(pictures.astype(np.float32) / 255 * gain + offset, 0.0, 1.0).astype(np.float32)
 
