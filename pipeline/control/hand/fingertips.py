@@ -9,7 +9,6 @@ from torch import Tensor
 
 from ...geometry.rotation import quat_rotate
 from ...physics.chains.chain import Chain
-from ...physics.rollout import Rollout
 from ...physics.world import World
 
 
@@ -37,12 +36,9 @@ class Fingertips:
                 found[world.body_names.index(joint.link)] = points[points.norm(dim=-1).argmax()]
         return Fingertips(tuple(found), torch.stack(list(found.values())) if found else torch.zeros(0, 3))
 
-    def places(self, motion: Rollout) -> Tensor:
-        """Return the places (b, frames, tips, 3) of the tips in a motion [m]."""
-        # indexing by a list takes twice as long
-        links = torch.tensor(self.links, dtype=torch.long)
-        places, turns = (part.index_select(2, links) for part in (motion.position_m, motion.quat_wxyz))
-        return places + quat_rotate(turns, self.points)
+    def places(self, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
+        """Return the places (..., tips, 3) of the tips [m] from positions [m] and orientations of their links."""
+        return position_m + quat_rotate(quat_wxyz, self.points)
 
 
 def _points(world: World, chain: Chain, link: str) -> Tensor:

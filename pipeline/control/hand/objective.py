@@ -73,16 +73,19 @@ class HandObjective:
 
     def residuals(self, values: Tensor, draws: Tensor) -> Tensor:
         """See :class:`Objective`."""
-        costs = self.hand.task.costs
+        costs, tips = self.hand.task.costs, self.hand.tips
         motion, targets = self._predicted(values, draws)
-        place = motion.position_m[:, 1:, self.hand.object] - torch.tensor(self.hand.task.wanted_m, dtype=torch.float64)
-        turn = quat_turn(torch.as_tensor(self.goal_wxyz), motion.quat_wxyz[:, 1:, self.hand.object])
+        # of many bodies in a motion few count: gathered once, they lie together
+        counted = torch.tensor((self.hand.object, *tips.links))
+        position, quat = (part[:, 1:].index_select(2, counted) for part in (motion.position_m, motion.quat_wxyz))
+        place = position[:, :, 0] - torch.tensor(self.hand.task.wanted_m, dtype=torch.float64)
+        turn = quat_turn(torch.as_tensor(self.goal_wxyz), quat[:, :, 0])
         lost = ((place.square().sum(-1, keepdim=True) + 1e-24).sqrt() - costs.keep_m).clamp_min(0.0)
         errors = torch.cat((place / costs.position_m, lost / costs.lost_m, turn / math.radians(costs.turn_deg)), -1)
         weight = torch.full((errors.shape[1],), costs.path / errors.shape[1], dtype=torch.float64)
         weight[-1] += 1.0
-        tips = self.hand.tips.places(motion)[:, 1:] - motion.position_m[:, 1:, None, self.hand.object]
-        reach = tips.flatten(1) / (costs.reach_m * math.sqrt(max(1, tips[0, ..., 0].numel())))
+        apart = tips.places(position[:, :, 1:], quat[:, :, 1:]) - position[:, :, :1]
+        reach = apart.flatten(1) / (costs.reach_m * math.sqrt(max(1, apart[0, ..., 0].numel())))
         speeds = targets.diff(dim=1) / torch.as_tensor(np.diff(self.times_s))[:, None]
         share = 1 / math.sqrt(speeds.shape[1] * speeds.shape[2])
         errors = (errors * weight.sqrt()[:, None]).flatten(1)
@@ -92,14 +95,13 @@ class HandObjective:
         """Return the targets (b, L + N, joints) [rad] of sequences (b, N, joints), within range and speed."""
         hand = self.hand
         lower, upper, home, span = (torch.as_tensor(x) for x in (hand.lower, hand.upper, hand.home, hand.span))
-        wanted = torch.minimum(torch.maximum(home + values * span, lower), upper)
-        before = torch.as_tensor(self.given_rad[-1]).expand(len(values), -1)
-        found = [torch.as_tensor(self.given_rad).expand(len(values), *self.given_rad.shape)]
-        for knot, length in enumerate(np.diff(self.times_s)[len(self.given_rad) - 1 :]):
-            reach = hand.task.limits.speed_rad_s * float(length)
-            before = torch.minimum(torch.maximum(wanted[:, knot], before - reach), before + reach)
-            found.append(before[:, None])
-        return torch.cat(found, 1)
+        wanted = (home + values * span).clamp(lower, upper)
+        given = torch.as_tensor(self.given_rad).expand(len(values), *self.given_rad.shape)
+        found = [*given.unbind(1)]
+        for there, length in zip(wanted.unbind(1), np.diff(self.times_s)[len(given[0]) - 1 :].tolist(), strict=True):
+            reach = hand.task.limits.speed_rad_s * length
+            found.append(there.clamp(found[-1] - reach, found[-1] + reach))
+        return torch.stack(found, 1)
 
     def values_of(self, targets: Targets) -> Tensor:
         """Return the sequence (N, joints) of targets."""
