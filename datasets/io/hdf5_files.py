@@ -87,13 +87,10 @@ def own_objects(group: h5py.Group, where: str) -> Iterator[tuple[str, h5py.Group
                 f"{MOST_DEEP} groups in each other.",
                 "take the original file.",
             )
-        inside: list[tuple[str, Any]] = []
-        for name in sorted(item):
-            path = f"{place}/{name}".lstrip("/")
-            if is_own_link(item, name, f"{where}/{path}"):
-                inside.append((path, item[name]))
-            else:
-                soft.append((item, name, path))
+        paths = {name: f"{place}/{name}".lstrip("/") for name in sorted(item)}
+        own = {name: is_own_link(item, name, f"{where}/{path}") for name, path in paths.items()}
+        soft += [(item, name, path) for name, path in paths.items() if not own[name]]
+        inside = [(path, item[name]) for name, path in paths.items() if own[name]]
         pending.extend(entry for entry in reversed(inside) if isinstance(entry[1], h5py.Group | h5py.Dataset))
     for parent, name, path in soft:  # last, when it is known that no path leads through a link to another file
         _require_target(parent, name, f"{where}/{path}")
@@ -158,25 +155,16 @@ def require_stored(
     if made.get_layout() == h5py.h5d.VIRTUAL:
         _require_sources(item, where, files or {}, depth)
         return
-    size = math.prod(item.shape) * item.dtype.itemsize
     chunks = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else None
-    if chunks is not None:
-        chunk = math.prod(chunks) * item.dtype.itemsize
-        if chunk > MOST_CHUNK_BYTES:
-            raise InputDataError(
-                f"{where}: chunks of {chunk / 2**30:.1f} GiB.",
-                f"{MOST_CHUNK_BYTES / 2**30:g} GiB.",
-                "write the file with smaller chunks.",
-            )
-    stored = item.id.get_storage_size()
-    whole = stored > 0
-    if whole and size > NEEDS_NO_PROOF_BYTES:
-        if chunks is None:
-            whole = stored >= size
-        else:
-            count = math.prod(-(-length // part) for length, part in zip(item.shape, chunks, strict=True))
-            whole = item.id.get_num_chunks() == count
-    if size and not whole:
+    chunk = 0 if chunks is None else math.prod(chunks) * item.dtype.itemsize
+    if chunk > MOST_CHUNK_BYTES:
+        raise InputDataError(
+            f"{where}: chunks of {chunk / 2**30:.1f} GiB.",
+            f"{MOST_CHUNK_BYTES / 2**30:g} GiB.",
+            "write the file with smaller chunks.",
+        )
+    size, stored = math.prod(item.shape) * item.dtype.itemsize, item.id.get_storage_size()
+    if size and not _is_whole(item, size, stored, chunks):
         raise InputDataError(
             f"{where}: declares {item.dtype} {item.shape}, {size / 2**20:.3g} MiB, of which {stored} bytes are stored.",
             "arrays that are written completely.",
@@ -184,28 +172,41 @@ def require_stored(
         )
 
 
+def _is_whole(item: h5py.Dataset, size: int, stored: int, chunks: tuple[int, ...] | None) -> bool:
+    """Return whether all of an array is stored, of which so many bytes are; of a small one a part is enough."""
+    if stored <= 0 or size <= NEEDS_NO_PROOF_BYTES:
+        return stored > 0
+    if chunks is None:
+        return stored >= size
+    count = math.prod(-(-length // part) for length, part in zip(item.shape, chunks, strict=True))
+    return item.id.get_num_chunks() == count
+
+
+def _opened(files: Mapping[str, Callable[[], h5py.File]], name: str, where: str) -> h5py.File:
+    """Return one of the files that a virtual array may look into."""
+    if name not in files:
+        raise InputDataError(
+            f"{where}: looks into another file, {name}.",
+            "the files of the dataset.",
+            "write the numbers into the file itself.",
+        )
+    return files[name]()
+
+
 def _require_sources(item: h5py.Dataset, where: str, files: Mapping[str, Callable[[], h5py.File]], depth: int) -> None:
     """Refuse a virtual array that looks elsewhere than into the given files, or whose sources do not cover it."""
-    covered = 0
     if depth > 1:
         raise InputDataError(
             f"{where}: a virtual array of virtual arrays.",
             "arrays in files.",
             "write the numbers into the file itself.",
         )
+    covered = 0
     for source in item.virtual_sources():
-        if source.file_name != "." and source.file_name not in files:
-            raise InputDataError(
-                f"{where}: looks into another file, {source.file_name}.",
-                "the files of the dataset.",
-                "write the numbers into the file itself.",
-            )
         taken = source.vspace.get_select_npoints()
         covered += taken
-        if source.file_name == ".":
-            _require_source(item.file, source.dset_name, taken, where, files, depth)
-        else:
-            _require_source(files[source.file_name](), source.dset_name, taken, where, files, depth)
+        file = item.file if source.file_name == "." else _opened(files, source.file_name, where)
+        _require_source(file, source.dset_name, taken, where, files, depth)
     if covered < math.prod(item.shape):
         raise InputDataError(
             f"{where}: declares {item.shape}, of which {covered} numbers have a source.",

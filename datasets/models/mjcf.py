@@ -28,7 +28,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...schemas import ArticulationModel, BodyModel, ContactParameters, InputDataError, ModelFile
+from ...schemas import ArticulationModel, BodyModel, ContactParameters, InputDataError, JointModel, ModelFile
 from ...schemas.materials import pair_of
 from ...schemas.surfaces import Surface
 from ..capture.cameras import Camera
@@ -98,17 +98,7 @@ def write_mjcf(
     file = model.file
     refuse_paper_law(file, model.place, "MJCF")
     root = ET.Element("mujoco", model="cgwm")
-    ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    # RK4: the other integrators damp the tumbling of a free body.
-    option = {"timestep": _text(_timestep(file)), "gravity": _text(file.gravity_m_s2), "integrator": "RK4"}
-    if _slippery(model):
-        option |= {"impratio": _text(APART), "noslip_iterations": str(APART_ITERATIONS)}
-    ET.SubElement(root, "option", option, cone="elliptic")
-    defaults = ET.SubElement(root, "default")
-    geom = ET.SubElement(defaults, "geom", contype="1", conaffinity="1", condim="3")
-    geom.attrib.update(_contact(file.contact))
-    if file.contact is not None:
-        ET.SubElement(defaults, "pair", _pair(file.contact, _slippery(model)))
+    _add_options(root, model)
     world = ET.SubElement(root, "worldbody")
     if file.ground is not None:
         normal = np.asarray(file.ground.normal)
@@ -267,6 +257,22 @@ def _add_contacts(root: ET.Element, model: Model) -> None:
         root.append(contact)
 
 
+def _add_options(root: ET.Element, model: Model) -> None:
+    """Add the settings of the solver, and what geoms and pairs have in common."""
+    file = model.file
+    ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
+    # RK4: the other integrators damp the tumbling of a free body.
+    option = {"timestep": _text(_timestep(file)), "gravity": _text(file.gravity_m_s2), "integrator": "RK4"}
+    if _slippery(model):
+        option |= {"impratio": _text(APART), "noslip_iterations": str(APART_ITERATIONS)}
+    ET.SubElement(root, "option", option, cone="elliptic")
+    defaults = ET.SubElement(root, "default")
+    geom = ET.SubElement(defaults, "geom", contype="1", conaffinity="1", condim="3")
+    geom.attrib.update(_contact(file.contact))
+    if file.contact is not None:
+        ET.SubElement(defaults, "pair", _pair(file.contact, _slippery(model)))
+
+
 def _add_pairs(contact: ET.Element, model: Model) -> None:
     """Add a `pair` for each two geoms that may touch.
 
@@ -280,16 +286,20 @@ def _add_pairs(contact: ET.Element, model: Model) -> None:
         count = len(mine) * len(names)
         if own is None and (file.contact is None or count > MOST_COMMON_PAIRS):
             continue
-        if count > MOST_PAIRS:
-            raise InputDataError(
-                f"body '{body.name}' and '{other}' have {len(mine)} and {len(names)} geoms and a contact law of "
-                f"their own, which MJCF needs {count} pairs for.",
-                f"up to {MOST_PAIRS} pairs.",
-                "fit with fewer collision spheres (--spheres), or give the surface fewer triangles.",
-            )
+        _require_few_pairs(body.name, other, len(mine), len(names))
         numbers = {} if own is None else _pair(own, _slippery(model))
         for first, second in product(mine, names):
             ET.SubElement(contact, "pair", geom1=first, geom2=second).attrib.update(numbers)
+
+
+def _require_few_pairs(body: str, other: str, mine: int, others: int) -> None:
+    if mine * others > MOST_PAIRS:
+        raise InputDataError(
+            f"body '{body}' and '{other}' have {mine} and {others} geoms and a contact law of "
+            f"their own, which MJCF needs {mine * others} pairs for.",
+            f"up to {MOST_PAIRS} pairs.",
+            "fit with fewer collision spheres (--spheres), or give the surface fewer triangles.",
+        )
 
 
 def softer_pairs(model: Model) -> list[tuple[str, str]]:
@@ -344,13 +354,18 @@ def _add_articulation(world: ET.Element, one: ArticulationModel, model: Model) -
         element = elements[joint.link] = _add_body(elements[joint.parent], model.body(joint.link), model, place, "link")
         if joint.kind == "fixed":
             continue
-        numbers = {"damping": joint.damping, "frictionloss": joint.friction, "armature": joint.armature}
-        made = ET.SubElement(element, "joint", name=joint.name, type=joint.kind, axis=_text(joint.axis))
-        made.attrib.update({name: _text(value) for name, value in numbers.items()})
-        if joint.lower is not None or joint.upper is not None:
-            low = -FAR if joint.lower is None else joint.lower
-            high = FAR if joint.upper is None else joint.upper
-            made.set("range", _text((low, high)))
+        _add_joint(element, joint)
+
+
+def _add_joint(element: ET.Element, joint: JointModel) -> None:
+    """Add a hinge or a slide to the body that it moves."""
+    numbers = {"damping": joint.damping, "frictionloss": joint.friction, "armature": joint.armature}
+    made = ET.SubElement(element, "joint", name=joint.name, type=joint.kind, axis=_text(joint.axis))
+    made.attrib.update({name: _text(value) for name, value in numbers.items()})
+    if joint.lower is not None or joint.upper is not None:
+        low = -FAR if joint.lower is None else joint.lower
+        high = FAR if joint.upper is None else joint.upper
+        made.set("range", _text((low, high)))
 
 
 def _add_servos(root: ET.Element, file: ModelFile) -> None:
@@ -375,6 +390,12 @@ def _add_body(
     if motion != "fixed":
         inertia = _text(body.inertia_kg_m2)
         ET.SubElement(element, "inertial", pos=_text(body.com_m), mass=_text(body.mass_kg), fullinertia=inertia)
+    _add_geoms(element, body, model)
+    return element
+
+
+def _add_geoms(element: ET.Element, body: BodyModel, model: Model) -> None:
+    """Add the collision spheres of a body; without them, its box or ball."""
     spheres = model.collision.get(body.name)
     if spheres is not None:
         radii = np.asarray(spheres.scales, float) * body.radius_factor
@@ -382,13 +403,12 @@ def _add_body(
         for name, center, radius in parts:
             geom = ET.SubElement(element, "geom", name=name)
             geom.attrib.update(type="sphere", pos=_text(center), size=_text(radius))
-    elif body.shape is not None and (body.shape.box is not None or body.shape.sphere is not None):
+    elif body.shape is not None and body.shape.box is not None:
         geom = ET.SubElement(element, "geom", name=_geoms(body, model)[0])
-        if body.shape.box is not None:
-            geom.attrib.update(type="box", size=_text(body.shape.box.half_extents_m))
-        elif body.shape.sphere is not None:
-            geom.attrib.update(type="sphere", size=_text(body.shape.sphere.radius_m))
-    return element
+        geom.attrib.update(type="box", size=_text(body.shape.box.half_extents_m))
+    elif body.shape is not None and body.shape.sphere is not None:
+        geom = ET.SubElement(element, "geom", name=_geoms(body, model)[0])
+        geom.attrib.update(type="sphere", size=_text(body.shape.sphere.radius_m))
 
 
 def _add_keyframe(root: ET.Element, file: ModelFile, keyframe: Keyframe) -> None:

@@ -83,23 +83,12 @@ def read_model(path: Path | str) -> Model:
     refuse_other_kind(root, "model")
     file = read_json(root / "model.json", ModelFile)
     file = file.model_copy(update={"effects": unpack_effects(file.effects, root)})
-    body_splats: dict[str, Splats] = {}
-    collision: dict[str, Splats] = {}
-    for body in file.bodies:
-        if body.splats is not None:
-            body_splats[body.name] = collision[body.name] = read_splats(_inside(root, body.splats), harmonics=True)
-        if body.collision is not None:
-            collision[body.name] = read_splats(_inside(root, body.collision))
+    body_splats, collision = _spheres(root, file)
     require_agreement(file, collision, root / "model.json")
     for surface in file.surfaces:
         if surface.mesh is not None:
             _inside(root, surface.mesh.path)
     scene = None if file.scene is None else read_splats(_inside(root, file.scene), harmonics=True)
-    fit = read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile()
-    pictures = {name: (root / name).read_bytes() for name in PICTURES if (root / name).is_file()}
-    cameras = None
-    if (root / CAMERAS).is_file():
-        cameras = require_rigid(root / CAMERAS, read_json(root / CAMERAS, CamerasFile))
     names = [body.name for body in file.bodies]
     tracks = {path.stem: read_tracks(path, names)[0] for path in sorted((root / POSE_TRACKS).glob("*.csv"))}
     return Model(
@@ -109,11 +98,27 @@ def read_model(path: Path | str) -> Model:
         collision=collision,
         surface_meshes=surface_meshes(file.surfaces, root),
         scene=scene,
-        fit=fit,
-        cameras=cameras,
-        pictures=pictures,
+        fit=read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile(),
+        cameras=_cameras(root / CAMERAS),
+        pictures={name: (root / name).read_bytes() for name in PICTURES if (root / name).is_file()},
         tracks=tracks,
     )
+
+
+def _spheres(root: Path, file: ModelFile) -> tuple[dict[str, Splats], dict[str, Splats]]:
+    """Return the spheres of each body that are seen, and those that collide."""
+    visual: dict[str, Splats] = {}
+    collision: dict[str, Splats] = {}
+    for body in file.bodies:
+        if body.splats is not None:
+            visual[body.name] = collision[body.name] = read_splats(_inside(root, body.splats), harmonics=True)
+        if body.collision is not None:
+            collision[body.name] = read_splats(_inside(root, body.collision))
+    return visual, collision
+
+
+def _cameras(path: Path) -> CamerasFile | None:
+    return require_rigid(path, read_json(path, CamerasFile)) if path.is_file() else None
 
 
 def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Model:
@@ -142,20 +147,25 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
             write_splats(directory / name, splats, "body")
         for name, mesh in meshes.values():
             (directory / name).write_text(obj_text(mesh), encoding="utf-8")
-        if model.scene is not None:
-            write_splats(directory / "scene.ply", model.scene, "world")
-        if model.cameras is not None:
-            (directory / CAMERAS).write_text(model.cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
-        for name, content in model.pictures.items():
-            (directory / name).write_bytes(content)
-        if model.tracks:
-            (directory / POSE_TRACKS).mkdir()
-        for episode, tracks in model.tracks.items():
-            write_tracks(directory / POSE_TRACKS / f"{episode}.csv", tracks)
+        _write_surroundings(directory, model)
         (directory / "fit.json").write_text(model.fit.model_dump_json(indent=1) + "\n", encoding="utf-8")
         packed = file.model_copy(update={"effects": pack_effects(file.effects, directory)})
         (directory / "model.json").write_text(packed.model_dump_json(indent=1) + "\n", encoding="utf-8")
     return replace(model, root=Path(path), file=file)
+
+
+def _write_surroundings(directory: Path, model: Model) -> None:
+    """Write what a model has beside its bodies: the background, cameras, pictures and tracks of poses."""
+    if model.scene is not None:
+        write_splats(directory / "scene.ply", model.scene, "world")
+    if model.cameras is not None:
+        (directory / CAMERAS).write_text(model.cameras.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    for name, content in model.pictures.items():
+        (directory / name).write_bytes(content)
+    if model.tracks:
+        (directory / POSE_TRACKS).mkdir()
+    for episode, tracks in model.tracks.items():
+        write_tracks(directory / POSE_TRACKS / f"{episode}.csv", tracks)
 
 
 def _free_name(body: str, suffix: str, taken: set[str]) -> str:

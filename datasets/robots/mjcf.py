@@ -26,16 +26,7 @@ def read_mjcf(path: Path) -> Articulation:
     becomes as many links, of which the last has its mass and geometry. Collision geometry is what has contype or
     conaffinity.
     """
-    mujoco: Any = importlib.import_module("mujoco")
-
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise InputDataError(
-            f"{path}: MuJoCo cannot read it: {' '.join(str(error).split()).rstrip('.')}.",
-            "an MJCF file.",
-            "open the file in MuJoCo's viewer, which names the fault, and correct it.",
-        ) from error
+    model = _model_of(path)
     if model.neq:
         raise InputDataError(
             f"{path}: it has {model.neq} equality constraints (loops or joints that mimic others).",
@@ -57,6 +48,20 @@ def read_mjcf(path: Path) -> Articulation:
     for body in range(1, model.nbody):
         _append(path, model, body, links, joints, ends)
     return Articulation.tree(path.stem, path, links, joints)
+
+
+def _model_of(path: Path) -> Any:
+    """Return MuJoCo's model of a file."""
+    mujoco: Any = importlib.import_module("mujoco")
+
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise InputDataError(
+            f"{path}: MuJoCo cannot read it: {' '.join(str(error).split()).rstrip('.')}.",
+            "an MJCF file.",
+            "open the file in MuJoCo's viewer, which names the fault, and correct it.",
+        ) from error
 
 
 def _require_plain_joints(path: Path, model: Any) -> None:
@@ -161,13 +166,7 @@ def _carrier(
 def _joint(model: Any, number: int, parent: str, link: str, position: Array, quat: Array) -> JointOfRobot:
     dof = model.jnt_dofadr[number]
     limited = bool(model.jnt_limited[number])
-    servo = [k for k in range(model.nu) if model.actuator_trntype[k] == 0 and model.actuator_trnid[k, 0] == number]
-    stiffness, extra, limit = 0.0, 0.0, math.inf
-    if servo:
-        stiffness = max(0.0, -float(model.actuator_biasprm[servo[0], 1]))
-        extra = max(0.0, -float(model.actuator_biasprm[servo[0], 2]))
-        if model.actuator_forcelimited[servo[0]]:
-            limit = float(model.actuator_forcerange[servo[0], 1])
+    stiffness, extra, limit = _servo(model, number)
     return JointOfRobot(
         name=model.joint(number).name or f"joint{number}",
         kind="hinge" if model.jnt_type[number] == 3 else "slide",
@@ -184,6 +183,16 @@ def _joint(model: Any, number: int, parent: str, link: str, position: Array, qua
         friction=float(model.dof_frictionloss[dof]),
         torque_limit=limit,
     )
+
+
+def _servo(model: Any, joint: int) -> tuple[float, float, float]:
+    """Return stiffness, damping and largest torque of the first actuator of a joint; 0, 0 and infinity without one."""
+    for k in range(model.nu):
+        if model.actuator_trntype[k] == 0 and model.actuator_trnid[k, 0] == joint:
+            stiffness, damping = (max(0.0, -float(value)) for value in model.actuator_biasprm[k, 1:3])
+            limited = bool(model.actuator_forcelimited[k])
+            return stiffness, damping, float(model.actuator_forcerange[k, 1]) if limited else math.inf
+    return 0.0, 0.0, math.inf
 
 
 def _link(model: Any, body: int, name: str, origin: Array | None) -> LinkOfRobot:

@@ -98,14 +98,17 @@ def _link(path: Path, name: str, element: Element) -> LinkOfRobot:
             raise InputDataError(
                 f"{path}: {where}: its mass is {mass:g} kg.", "0 kg or more.", "correct the mass in the file."
             )
-        keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
         if moments is not None:
-            xx, yy, zz, xy, xz, yz = (
-                float(_numbers(path, f"{where}, {key}", moments.get(key), 1, "0")[0]) for key in keys
-            )
-            inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+            inertia = turn @ _tensor(path, where, moments) @ turn.T
     parts = [_geometry(path, where, part) for part in element.findall("collision")]
     return LinkOfRobot(name=name, mass_kg=mass, com_m=com, inertia_kg_m2=inertia, geometry=tuple(parts))
+
+
+def _tensor(path: Path, where: str, moments: Element) -> Array:
+    """Return the inertia tensor (3, 3) [kg m2] of an <inertia>."""
+    keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    xx, yy, zz, xy, xz, yz = (float(_numbers(path, f"{where}, {key}", moments.get(key), 1, "0")[0]) for key in keys)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _geometry(path: Path, where: str, element: Element) -> GeometryOfLink:
@@ -118,7 +121,16 @@ def _geometry(path: Path, where: str, element: Element) -> GeometryOfLink:
             "box, sphere, cylinder, mesh.",
             "add a geometry, or remove the collision element.",
         )
-    mesh, size = None, ()
+    if shape.tag == "mesh":
+        found, size = read_mesh(_mesh_path(path, where, shape.get("filename", ""))), ()
+        mesh = Mesh(found.vertices * _numbers(path, f"{where}, scale", shape.get("scale"), 3, "1 1 1"), found.faces)
+    else:
+        mesh, size = None, _size(path, where, shape)
+    return GeometryOfLink(kind=shape.tag, size_m=size, rotation=rotation, position_m=position, mesh=mesh)
+
+
+def _size(path: Path, where: str, shape: Element) -> tuple[float, ...]:
+    """Return the half extents, the radius, or radius and half length of a shape [m]."""
     if shape.tag == "box":
         size = tuple(0.5 * _numbers(path, f"{where}, box size", shape.get("size"), 3, ""))
     elif shape.tag == "sphere":
@@ -126,9 +138,6 @@ def _geometry(path: Path, where: str, element: Element) -> GeometryOfLink:
     elif shape.tag in ("cylinder", "capsule"):
         radius = float(_numbers(path, f"{where}, radius", shape.get("radius"), 1, "")[0])
         size = (radius, 0.5 * float(_numbers(path, f"{where}, length", shape.get("length"), 1, "")[0]))
-    elif shape.tag == "mesh":
-        found = read_mesh(_mesh_path(path, where, shape.get("filename", "")))
-        mesh = Mesh(found.vertices * _numbers(path, f"{where}, scale", shape.get("scale"), 3, "1 1 1"), found.faces)
     else:
         raise InputDataError(
             f"{path}: {where}: the geometry <{shape.tag}>.",
@@ -139,7 +148,7 @@ def _geometry(path: Path, where: str, element: Element) -> GeometryOfLink:
         raise InputDataError(
             f"{path}: {where}: a {shape.tag} of size {size}.", "sizes above 0 m.", "correct the size in the file."
         )
-    return GeometryOfLink(kind=shape.tag, size_m=size, rotation=rotation, position_m=position, mesh=mesh)
+    return size
 
 
 def _mesh_path(path: Path, where: str, name: str) -> Path:
@@ -159,6 +168,33 @@ def _mesh_path(path: Path, where: str, name: str) -> Path:
 def _joint(path: Path, element: Element) -> JointOfRobot:
     name = _name(path, element, "joint")
     where, kind = f"joint '{name}'", element.get("type", "")
+    _require_known(path, where, kind, element)
+    ends = [element.find(tag) for tag in ("parent", "child")]
+    parent, child = ("" if end is None else end.get("link", "") for end in ends)
+    origin, axis = element.find("origin"), element.find("axis")
+    position, _ = _origin(path, where, origin)
+    rpy = _numbers(path, where, None if origin is None else origin.get("rpy"), 3, "0 0 0")
+    limit, dynamics = element.find("limit"), element.find("dynamics")
+    lower, upper = _limits(path, where, kind, limit)
+    direction = _numbers(path, f"{where}, axis", None if axis is None else axis.get("xyz"), 3, "1 0 0")
+    return JointOfRobot(
+        name=name,
+        kind=_KINDS[kind],
+        parent=parent,
+        link=child,
+        position_m=position,
+        quat_wxyz=quat_of(rpy),
+        axis=direction if kind != "fixed" else np.array([0.0, 0.0, 1.0]),
+        lower=lower,
+        upper=upper,
+        damping=_value(path, where, dynamics, "damping", 0.0),
+        friction=_value(path, where, dynamics, "friction", 0.0),
+        torque_limit=_value(path, where, limit, "effort", math.inf) or math.inf,
+    )
+
+
+def _require_known(path: Path, where: str, kind: str, element: Element) -> None:
+    """Refuse a joint of another type, and one that mimics another."""
     if kind not in _KINDS:
         raise InputDataError(
             f"{path}: {where} has the type '{kind}'.",
@@ -171,18 +207,19 @@ def _joint(path: Path, element: Element) -> JointOfRobot:
             "joints without <mimic>.",
             "leave <mimic> out, and command both joints alike.",
         )
-    ends = [element.find(tag) for tag in ("parent", "child")]
-    parent, child = ("" if end is None else end.get("link", "") for end in ends)
-    origin, axis = element.find("origin"), element.find("axis")
-    position, _ = _origin(path, where, origin)
-    rpy = _numbers(path, where, None if origin is None else origin.get("rpy"), 3, "0 0 0")
-    limit, dynamics = element.find("limit"), element.find("dynamics")
 
-    def value(holder: Element | None, key: str, default: float) -> float:
-        text = None if holder is None else holder.get(key)
-        return float(_numbers(path, f"{where}, {key}", text, 1, "0")[0]) if text is not None else default
 
-    lower, upper = value(limit, "lower", -math.inf), value(limit, "upper", math.inf)
+def _value(path: Path, where: str, holder: Element | None, key: str, default: float) -> float:
+    """Return the number of an attribute; `default` without it, or without the element."""
+    text = None if holder is None else holder.get(key)
+    return float(_numbers(path, f"{where}, {key}", text, 1, "0")[0]) if text is not None else default
+
+
+def _limits(path: Path, where: str, kind: str, limit: Element | None) -> tuple[float, float]:
+    """Return the lowest and the highest angle [rad] or place [m] of a joint."""
+    lower, upper = _value(path, where, limit, "lower", -math.inf), _value(path, where, limit, "upper", math.inf)
+    if kind == "continuous":
+        return -math.inf, math.inf
     if kind in ("revolute", "prismatic") and not (math.isfinite(lower) and math.isfinite(upper)):
         if limit is None or (limit.get("lower") is None) != (limit.get("upper") is None):
             raise InputDataError(
@@ -190,21 +227,5 @@ def _joint(path: Path, element: Element) -> JointOfRobot:
                 "<limit lower=... upper=.../>.",
                 'give it limits, or the type "continuous".',
             )
-        lower = upper = 0.0  # the format's default
-    if kind == "continuous":
-        lower, upper = -math.inf, math.inf
-    direction = _numbers(path, f"{where}, axis", None if axis is None else axis.get("xyz"), 3, "1 0 0")
-    return JointOfRobot(
-        name=name,
-        kind=_KINDS[kind],
-        parent=parent,
-        link=child,
-        position_m=position,
-        quat_wxyz=quat_of(rpy),
-        axis=direction if kind != "fixed" else np.array([0.0, 0.0, 1.0]),
-        lower=lower,
-        upper=upper,
-        damping=value(dynamics, "damping", 0.0),
-        friction=value(dynamics, "friction", 0.0),
-        torque_limit=value(limit, "effort", math.inf) or math.inf,
-    )
+        return 0.0, 0.0  # the format's default
+    return lower, upper
