@@ -84,13 +84,19 @@ def _story(result: MysteryResult, out: Path) -> str:
         listed = ", ".join(f"{p.name} = {quantity(p.estimate)} +- {quantity(p.std_error)} {p.unit}" for p in numbers)
         lines.append(f"add       m1, with {listed}")
         lines.append(f"compare   {result.comparison.verdict}")
-    truth = [
+    lines.append(f"hidden    {result.sentence}" + "".join(f" True: {words}." for words in _truth(result)))
+    lines += [*warnings(result.warnings), f"{sum(result.seconds.values()):.0f} s."]
+    return "\n".join([*lines, f"Report: {out / result.paths['report']}"])
+
+
+def _truth(result: MysteryResult) -> list[str]:
+    """Return the numbers of each hidden effect."""
+    from .output import quantity
+
+    return [
         ", ".join(f"{name} = {v if isinstance(v, list) else quantity(v)}" for name, v in effect.values.items())
         for effect in result.hidden
     ]
-    lines.append(f"hidden    {result.sentence}" + "".join(f" True: {words}." for words in truth))
-    lines += [*warnings(result.warnings), f"{sum(result.seconds.values()):.0f} s."]
-    return "\n".join([*lines, f"Report: {out / result.paths['report']}"])
 
 
 def _world(result: WorldDemoResult, out: Path) -> str:

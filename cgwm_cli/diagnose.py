@@ -14,7 +14,15 @@ from .verb import verb
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..schemas import ContactLimit, DiagnoseResult, NextExperiment, NextMotions, RankedEffect, Remaining
+    from ..schemas import (
+        ContactLimit,
+        DiagnoseResult,
+        NextExperiment,
+        NextMotions,
+        RankedEffect,
+        Remaining,
+        ResidualLaw,
+    )
 
 SHOWN = 8
 """Number of candidates that are listed; --json has all."""
@@ -92,30 +100,38 @@ def diagnose(
 
 def _summary(result: DiagnoseResult, model: Path, capture: Path, split: str) -> str:
     from ..pipeline.diagnose.report.next_command import next_command
-    from ..pipeline.report.page import listed
     from .output import next_line, table, warnings
 
     words = next_command(result, model, capture, split)
     rows = [_row(entry, result) for entry in _shown(result)]
     lines = [result.sentence, table(rows, ["effect", "acts in", "judged in", "p", "evidence", "estimate"])]
-    if result.flight_before is not None and result.flight_after is not None:
-        before, after = result.flight_before.statistic, result.flight_after.statistic
-        added = f"; with {listed(result.selected)} {after:.2f}" if result.selected else ""
-        lines.append(
-            f"misfit of the flights of '{split}' (mean chi2 of the force that each piece of at most 0.3 s lacks; noise "
-            f"alone gives 1): {before:.2f}{added}"
-        )
-    lines += [*_limits(result.contact_limits), *_held_out_errors(result.ranking, split)]
+    lines += [*_misfit(result, split), *_limits(result.contact_limits), *_held_out_errors(result.ranking, split)]
     lines += _remaining(result.remaining)
     if result.residual_law is not None:
-        terms = ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in result.residual_law.terms)
-        lines.append(f"law of the residual: {terms or 'none found'}")
+        lines.append(f"law of the residual: {_terms(result.residual_law) or 'none found'}")
     if result.next_experiment is not None:
         lines += _experiment(result.next_experiment)
     lines += _motions(result.next_motions)
     lines += [f"Wrote {result.saved_law.rpartition(':')[0]}."] if result.saved_law is not None else []
     lines += [f"Page: {result.report}"] if result.report is not None else []
     return "\n".join([*lines, *warnings(result.warnings), next_line(*words)])
+
+
+def _misfit(result: DiagnoseResult, split: str) -> list[str]:
+    """Return the misfit of the flights, without and with the named effects; nothing where it was not measured."""
+    from ..pipeline.report.page import listed
+
+    if result.flight_before is None or result.flight_after is None:
+        return []
+    added = f"; with {listed(result.selected)} {result.flight_after.statistic:.2f}" if result.selected else ""
+    return [
+        f"misfit of the flights of '{split}' (mean chi2 of the force that each piece of at most 0.3 s lacks; noise "
+        f"alone gives 1): {result.flight_before.statistic:.2f}{added}"
+    ]
+
+
+def _terms(law: ResidualLaw) -> str:
+    return ", ".join(f"{t.coefficient:.3g} {t.unit} [{t.term}]" for t in law.terms)
 
 
 def _shown(result: DiagnoseResult) -> list[RankedEffect]:

@@ -30,7 +30,19 @@ def _summary(report: DoctorReport) -> str:
     verdict = "ready" if report.ready else "not ready"
     lines = [f"cgwm {report.cgwm}: {verdict}."]
     lines += [f"  missing: {item.what} ({item.why}). Next: {item.todo}" for item in report.missing]
-    machine = [
+    packages = [[package.name, package.version or "missing", package.requirement] for package in report.packages]
+    extras = [
+        [one.name, f"missing: {', '.join(one.missing)}" if one.missing else "ready", one.purpose]
+        for one in report.extras
+    ]
+    uses = [[name.replace("_", " "), text] for name, text in report.uses.items()]
+    blocks = [("This machine", _machine(report)), ("Packages", packages)]
+    blocks += [("Extras, pip install 'cgwm[NAME]'", extras), ("What cgwm would use", uses)]
+    return "\n".join([*lines, *(f"{title}\n{table(rows)}" for title, rows in blocks)])
+
+
+def _machine(report: DoctorReport) -> list[list[str]]:
+    return [
         ["python", f"{report.python} on {report.platform}"],
         ["cores, memory for cgwm", f"{report.cpu_cores}, {report.memory_gib:.1f} GiB"],
         ["CUDA", ", ".join(report.cuda_devices) or "no device"],
@@ -39,12 +51,3 @@ def _summary(report: DoctorReport) -> str:
         ["COLMAP", f"{report.colmap or 'missing'}, {'CUDA' if report.colmap_cuda else 'CPU'} SIFT"],
         ["HDF5 zstd", "works" if report.hdf5_zstd else "does not work"],
     ]
-    packages = [[package.name, package.version or "missing", package.requirement] for package in report.packages]
-    extras = [
-        [one.name, f"missing: {', '.join(one.missing)}" if one.missing else "ready", one.purpose]
-        for one in report.extras
-    ]
-    uses = [[name.replace("_", " "), text] for name, text in report.uses.items()]
-    blocks = [("This machine", machine), ("Packages", packages)]
-    blocks += [("Extras, pip install 'cgwm[NAME]'", extras), ("What cgwm would use", uses)]
-    return "\n".join([*lines, *(f"{title}\n{table(rows)}" for title, rows in blocks)])

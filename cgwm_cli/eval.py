@@ -68,26 +68,27 @@ def _summary(result: EvalResult) -> str:
     count = f"{result.episodes} episode{'' if result.episodes == 1 else 's'}"
     head = f"{count}, open loop: {millimetres(move.median)}"
     head += f" and {turn.median:.1f} deg (medians)." if turn else " (median)."
-    rows = [_row("translation error [mm]", move, 1e3)]
-    rows += [
-        _row(name, summary, scale)
-        for name, summary, scale in (
-            ("rotation error [deg]", turn, 1.0),
-            ("PSNR, object [dB]", result.psnr_object_db, 1.0),
-            ("PSNR, frame [dB]", result.psnr_db, 1.0),
-            ("SSIM, frame [%]", result.ssim, 100.0),
-            ("IoU of silhouette and mask [%]", result.mask_iou, 100.0),
-            ("their centroids apart [px]", result.centroid_error_px, 1.0),
-            ("their outlines apart [px]", result.outline_error_px, 1.0),
-            ("centroids, triangulated [mm]", result.centroid_error_m, 1e3),
-            ("state-fitted residual [mm]", result.state_fitted_residual_m, 1e3),
-            ("noise of the start alone [mm]", result.state_noise_floor_m, 1e3),
-        )
-        if summary is not None
-    ]
+    rows = [_row(name, summary, scale) for name, summary, scale in _figures(result) if summary is not None]
     rows += [_baseline(name, figures) for name, figures in result.baselines.items()]
     lines = [head, table(rows, ["", "mean", "median", "final"]), *_by_images(result), *warnings(result.warnings)]
     return "\n".join([*lines, *([f"Page: {result.report}"] if result.report else [])])
+
+
+def _figures(result: EvalResult) -> tuple[tuple[str, ErrorSummary | None, float], ...]:
+    """Return what was measured: its name with the unit, the figures, and their factor to that unit."""
+    return (
+        ("translation error [mm]", result.translation_error_m, 1e3),
+        ("rotation error [deg]", result.rotation_error_deg, 1.0),
+        ("PSNR, object [dB]", result.psnr_object_db, 1.0),
+        ("PSNR, frame [dB]", result.psnr_db, 1.0),
+        ("SSIM, frame [%]", result.ssim, 100.0),
+        ("IoU of silhouette and mask [%]", result.mask_iou, 100.0),
+        ("their centroids apart [px]", result.centroid_error_px, 1.0),
+        ("their outlines apart [px]", result.outline_error_px, 1.0),
+        ("centroids, triangulated [mm]", result.centroid_error_m, 1e3),
+        ("state-fitted residual [mm]", result.state_fitted_residual_m, 1e3),
+        ("noise of the start alone [mm]", result.state_noise_floor_m, 1e3),
+    )
 
 
 def _by_images(result: EvalResult) -> list[str]:

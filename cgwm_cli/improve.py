@@ -75,7 +75,6 @@ def improve(
 
 def _summary(result: ImproveResult, out: Path, capture: Path) -> str:
     from ..pipeline.improve.wording import not_added_words, remaining_words
-    from ..pipeline.report.page import listed
     from .output import next_line, table, warnings
 
     rows = [[result.models[0], "", "", ""]]
@@ -88,17 +87,26 @@ def _summary(result: ImproveResult, out: Path, capture: Path) -> str:
     if last is not None and not last.added:
         lines.append(" ".join([f"{last.model}: {last.sentence}", *not_added_words(last)]))
         lines.append(f"left: {' '.join(remaining_words(last))}")
-    next_ = next((one for step in reversed(result.steps) if (one := step.next_experiment) is not None), None)
-    if next_ is not None:
-        why = f", to distinguish {listed(next_.separates)}" if next_.initial_state else ""
-        lines.append(f"Measure next{why}: {next_.what}.")
-    if last is not None and last.next_motions is not None:
-        lines.append("Record next, for contact:")
-        lines += [f"  {place}. {motion.what}" for place, motion in enumerate(last.next_motions.motions, 1)]
+    lines += _recordings(result)
     lines += [*warnings(result.warnings), f"Page: {out / result.page}"]
     if len(result.models) > 1:
         lines.append(next_line("cgwm", "compare", out / result.models[0], out / result.models[-1], capture))
     return "\n".join(lines)
+
+
+def _recordings(result: ImproveResult) -> list[str]:
+    """Return what to measure next: the throw that separates rivals, and the motions in contact."""
+    from ..pipeline.report.page import listed
+
+    lines = []
+    next_ = next((one for step in reversed(result.steps) if (one := step.next_experiment) is not None), None)
+    if next_ is not None:
+        why = f", to distinguish {listed(next_.separates)}" if next_.initial_state else ""
+        lines.append(f"Measure next{why}: {next_.what}.")
+    if result.steps and (motions := result.steps[-1].next_motions) is not None:
+        lines.append("Record next, for contact:")
+        lines += [f"  {place}. {motion.what}" for place, motion in enumerate(motions.motions, 1)]
+    return lines
 
 
 def _row(step: ImproveStep, result: ImproveResult) -> list[str]:

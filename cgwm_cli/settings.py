@@ -66,15 +66,7 @@ class StageSettings:
     def _assign(self, text: str) -> None:
         from ..schemas import UsageError, did_you_mean
 
-        key, equals, value = text.partition("=")
-        stage, *path = (part.strip() for part in key.split("."))
-        if not (equals and stage and path and all(path)):
-            example = f"{self._stages[0]}.seed=1"
-            raise UsageError(
-                f"--set {text}: not a setting.",
-                f"STAGE.KEY=VALUE, for example {example}.",
-                "write it as in the example.",
-            )
+        stage, path, value = self._parted(text)
         if stage not in self._stages:
             legal = f"{', '.join(self._stages)}.{did_you_mean(stage, self._stages)}"
             raise UsageError(
@@ -92,6 +84,20 @@ class StageSettings:
                     f"set '{part}' once: as a value, or the keys of a table.",
                 )
         table[path[-1]] = _value(value.strip())
+
+    def _parted(self, text: str) -> tuple[str, list[str], str]:
+        """Return the stage, the names below it, and the text of the value."""
+        from ..schemas import UsageError
+
+        key, equals, value = text.partition("=")
+        stage, *path = (part.strip() for part in key.split("."))
+        if not (equals and stage and path and all(path)):
+            raise UsageError(
+                f"--set {text}: not a setting.",
+                f"STAGE.KEY=VALUE, for example {self._stages[0]}.seed=1.",
+                "write it as in the example.",
+            )
+        return stage, path, value
 
 
 def _document_model(stages: Mapping[str, type[FileModel]]) -> type[FileModel]:

@@ -14,7 +14,7 @@ from .options import ConfigFile, Device, Overwrite, Seed, Settings, TrustEffects
 from .verb import verb
 
 if TYPE_CHECKING:
-    from ..schemas import DatasetSummary, ShardsSummary
+    from ..schemas import DatasetSummary, ShardsSummary, SynthesizeConfig
 
 
 @verb
@@ -72,20 +72,17 @@ def synthesize(
 ) -> None:
     """Make labelled rollouts of a model, in HDF5: images, depth, masks, poses, contacts, parameters."""
     trust(trust_effects)
-    from ..schemas import SynthesizeConfig, UsageError, plan_toml, read_plan
+    from .. import schemas
+    from ..schemas import UsageError, plan_toml
     from .settings import StageSettings
 
     _refuse_contradictions(shard, shards, ray, workers)
     index, count = _shard(shard) if shard is not None else (None, shards)
-    settings = StageSettings({"synthesize": SynthesizeConfig}, config, set_).configure(
-        "synthesize", SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
+    settings = StageSettings({"synthesize": schemas.SynthesizeConfig}, config, set_).configure(
+        "synthesize", schemas.SynthesizeConfig, rollouts=rollouts, shard=index, shards=count, seed=seed, device=device
     )
     if plan is not None:
-        if "plan" in settings.model_fields_set:
-            raise UsageError(
-                "--plan and synthesize.plan in the settings were given.", "one of the two.", "leave one of the two out."
-            )
-        settings = settings.model_copy(update={"plan": read_plan(plan)})
+        settings = _with_plan(settings, plan)
     if print_plan:
         from ..pipeline.synthesize.job import resolved_plan
 
@@ -105,6 +102,17 @@ def synthesize(
             settings = settings.model_copy(update={"shards": default_shards(settings.rollouts)})
         made = synthesize_shards(model, out, settings, overwrite, resume, ray, preview, workers)
         emit(made, lambda found: (_plan(found) if plan is not None else "") + _shards_summary(found))
+
+
+def _with_plan(settings: SynthesizeConfig, plan: Path) -> SynthesizeConfig:
+    """Return the settings with a plan from a file."""
+    from ..schemas import UsageError, read_plan
+
+    if "plan" in settings.model_fields_set:
+        raise UsageError(
+            "--plan and synthesize.plan in the settings were given.", "one of the two.", "leave one of the two out."
+        )
+    return settings.model_copy(update={"plan": read_plan(plan)})
 
 
 def _refuse_contradictions(shard: str | None, shards: int | None, ray: str | None, workers: int) -> None:

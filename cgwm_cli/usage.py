@@ -31,9 +31,14 @@ def explain(error: Any, arguments: list[str]) -> str:
     parameter = getattr(error, "param", None)
     if context and type(error).__name__ == "MissingParameter" and getattr(parameter, "nargs", 1) == -1:
         # of "MODEL... CAPTURE" a single path is taken for the last, although the first was meant
-        needed = [str(one.metavar or one.name) for one in context.command.params if one.param_type_name == "argument"]
-        return str(UsageError(f"{command}: {' and '.join(needed)} are needed; one of them is missing.", todo=todo))
+        needed = " and ".join(_arguments(context))
+        return str(UsageError(f"{command}: {needed} are needed; one of them is missing.", todo=todo))
     return str(UsageError(f"{command}: {message}{_nearest_choice(message)}", todo=todo))
+
+
+def _arguments(context: Any) -> list[str]:
+    """Return what the help calls the arguments of a command."""
+    return [str(one.metavar or one.name) for one in context.command.params if one.param_type_name == "argument"]
 
 
 def refuse_foreign(given: Iterable[str], legal: Iterable[str], where: str, todo: str = "") -> None:

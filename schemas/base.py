@@ -127,10 +127,7 @@ def _message(fault: Any, location: tuple, data: Any) -> str:
         message = "a name begins with a letter or digit and holds only letters, digits, '_', '.' and '-'"
     if fault["type"] == "model_type":
         message = "input should be a table"  # pydantic names the class, too
-    # "valid tuple" is Python's word for what is a list in the file.
-    message = (
-        (message[:1].lower() + message[1:]).replace("a valid tuple", "a list").replace("a valid dictionary", "a table")
-    )
+    message = _in_words_of_files(message)
     try:
         value = _at(data, location)
     except (KeyError, IndexError, TypeError):
@@ -138,6 +135,12 @@ def _message(fault: Any, location: tuple, data: Any) -> str:
     if isinstance(value, dict) or (isinstance(value, list) and fault["type"] == "value_error"):
         return shortened(message)
     return f"{shortened(message)} (found {json.dumps(value, default=str):.{SHOWN}})"
+
+
+def _in_words_of_files(message: str) -> str:
+    """Return a message of pydantic in small letters, with lists and tables for what Python calls them."""
+    small = message[:1].lower() + message[1:]
+    return small.replace("a valid tuple", "a list").replace("a valid dictionary", "a table")
 
 
 def _wrong_count(model: Any, location: tuple, data: Any) -> str:

@@ -128,7 +128,6 @@ class CalibrationReport(FileModel):
 
     def __str__(self) -> str:
         """Return the summary that the command prints."""
-        scale = self.scale
         lines = [
             f"{self.photos_registered} of {self.photos} photos registered, "
             f"{self.points} points, reprojection {self.reprojection_error_px:.2f} px, {self.wall_time_s:.0f} s",
@@ -146,16 +145,18 @@ class CalibrationReport(FileModel):
         if self.videos:
             seen = sum(verdict.registered for verdict in self.videos.values())
             lines.append(f"{seen} of {len(self.videos)} video cameras registered")
-        if scale.kind == "metric":
-            error = "" if scale.relative_std is None else f" +- {100 * scale.relative_std:.2f} %"
-            lines.append(f"scale: metric{error}, {scale.source}")
-        else:
-            lines.append("scale: unscaled; physics needs a metric scale (capture.toml, [calibration])")
-        lines.append(f"world frame: {self.world_frame}")
+        lines += [self._scale(), f"world frame: {self.world_frame}"]
         for name, verdict in {**self.images, **{f"video {k}": v for k, v in self.videos.items()}}.items():
             if not verdict.registered:
                 lines.append(f"not registered: {name}: {verdict.reason}")
         return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
+
+    def _scale(self) -> str:
+        """Return the line on the scale of lengths."""
+        if self.scale.kind != "metric":
+            return "scale: unscaled; physics needs a metric scale (capture.toml, [calibration])"
+        error = "" if self.scale.relative_std is None else f" +- {100 * self.scale.relative_std:.2f} %"
+        return f"scale: metric{error}, {self.scale.source}"
 
     def _centers(self) -> list[str]:
         """Return the line on how certain the optical centres are."""

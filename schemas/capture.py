@@ -311,19 +311,23 @@ def _require_known_materials(manifest: CaptureManifest) -> None:
     twice = repeated(known)
     if twice is not None:
         raise ValueError(f"two [[materials]] have the name '{twice}'; names must differ")
-    ground = manifest.world.ground
-    named = [(f"body '{body.name}'", body.material) for body in manifest.bodies]
-    named += [(f"surface '{surface.name}'", surface.material) for surface in manifest.surfaces]
-    named += [(f"articulation '{one.name}'", one.material) for one in manifest.articulations]
-    named += [("[world].ground", None if ground is None else ground.material)]
-    named += [("[[pairs]]", name) for pair in manifest.pairs for name in pair.materials]
-    for where, name in named:
+    for where, name in _named_materials(manifest):
         if name is not None and name not in known:
             listed = f"they are {', '.join(known)}" if known else "there are none"
             raise ValueError(f"{where} names the material '{name}', which is not among [[materials]]; {listed}")
     again = repeated(" and ".join(f"'{name}'" for name in pair_of(*pair.materials)) for pair in manifest.pairs)
     if again is not None:
         raise ValueError(f"two [[pairs]] are of {again}; each pair of materials stands once, in either order")
+
+
+def _named_materials(manifest: CaptureManifest) -> list[tuple[str, str | None]]:
+    """Return what has a material, in the words of messages, and its material."""
+    ground = manifest.world.ground
+    named = [(f"body '{body.name}'", body.material) for body in manifest.bodies]
+    named += [(f"surface '{surface.name}'", surface.material) for surface in manifest.surfaces]
+    named += [(f"articulation '{one.name}'", one.material) for one in manifest.articulations]
+    named += [("[world].ground", None if ground is None else ground.material)]
+    return named + [("[[pairs]]", name) for pair in manifest.pairs for name in pair.materials]
 
 
 class CaptureManifest(FileModel):
@@ -362,10 +366,14 @@ class CaptureManifest(FileModel):
         again = repeated([*names, *(surface.name for surface in self.surfaces)])
         if again is not None:
             raise ValueError(f"two surfaces, or a body and a surface, have the name '{again}'; names must differ")
+        self._require_distinct_episodes()
+        return self
+
+    def _require_distinct_episodes(self) -> None:
+        """Refuse a split with an episode twice, and one that is in both "train" and "test"."""
         for split, episodes in self.splits.items():
             if len(set(episodes)) != len(episodes):
                 raise ValueError(f"split '{split}' names an episode twice")
         train, test = set(self.splits.get("train", ())), set(self.splits.get("test", ()))
         if train & test:
             raise ValueError(f"episode '{min(train & test)}' is in both train and test")
-        return self

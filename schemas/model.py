@@ -97,12 +97,16 @@ class Correlation(FileModel):
             if min(abs(row[i] - 1), abs(row[i])) > ROUNDING:
                 raise ValueError(f"the correlation of '{self.parameters[i]}' with itself is {row[i]:g}, not 1")
             for j, value in enumerate(row[:i]):
-                pair = f"the correlation of '{self.parameters[i]}' and '{self.parameters[j]}'"
-                if abs(value) > 1 + ROUNDING:
-                    raise ValueError(f"{pair} is {value:g}; it lies between -1 and 1")
-                if abs(value - self.matrix[j][i]) > ROUNDING:
-                    raise ValueError(f"{pair} is {value:g}, the other way around {self.matrix[j][i]:g}")
+                self._require_correlation(i, j, value)
         return self
+
+    def _require_correlation(self, i: int, j: int, value: float) -> None:
+        """Refuse a correlation of two parameters that is none, or another one the other way around."""
+        pair = f"the correlation of '{self.parameters[i]}' and '{self.parameters[j]}'"
+        if abs(value) > 1 + ROUNDING:
+            raise ValueError(f"{pair} is {value:g}; it lies between -1 and 1")
+        if abs(value - self.matrix[j][i]) > ROUNDING:
+            raise ValueError(f"{pair} is {value:g}, the other way around {self.matrix[j][i]:g}")
 
 
 class HeldOutFall(FileModel):

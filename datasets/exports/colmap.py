@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import struct
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,6 @@ def write_colmap(
     """
     camera_ids = {name: number for number, name in enumerate(cameras.cameras, 1)}
     sensors = [camera_ids[image.camera] for image in cameras.images.values()]
-    copied = 0
     with new_directory(path, "COLMAP model", overwrite) as folder:
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
@@ -57,11 +57,7 @@ def write_colmap(
         }
         for name, data in files.items():
             (sparse / f"{name}.bin").write_bytes(data)
-        for name in cameras.images:
-            if photos is not None and (photos / name).is_file():
-                (folder / "images" / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(photos / name, folder / "images" / name)
-                copied += 1
+        copied = 0 if photos is None else _copy_photos(photos, cameras.images, folder / "images")
     counts = {"cameras": len(cameras.cameras), "images": len(cameras.images)}
     return {**counts, "points": len(points), "photos_copied": copied}
 
@@ -115,3 +111,12 @@ def _points(points: Splats) -> bytes:
     table = np.zeros(len(points), layout)
     table["id"], table["xyz"], table["rgb"], table["error"] = np.arange(1, len(points) + 1), points.means, colors, -1.0
     return struct.pack("<Q", len(points)) + table.tobytes()
+
+
+def _copy_photos(photos: Path, names: Iterable[str], images: Path) -> int:
+    """Copy the photos that there are; return their number."""
+    there = [name for name in names if (photos / name).is_file()]
+    for name in there:
+        (images / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(photos / name, images / name)
+    return len(there)

@@ -92,30 +92,15 @@ class _Writer:
 
     def episode(self, number: int) -> None:
         """Write the rollout at an index of the selection as the next episode."""
-        chosen, reader = self.chosen, self.chosen.reader
-        frames, episode = chosen.frames(number), len(self.rows)
-        count = len(frames)
-        columns = {
-            "observation.state": reader.read(number, "obs/object")[:: chosen.every].astype(np.float32),
-            "action": reader.read(number, "actions")[:: chosen.every].astype(np.float32),
-            "timestamp": (np.arange(count) / float(self.rate)).astype(np.float32),
-            "frame_index": np.arange(count),
-            "episode_index": np.full(count, episode),
-            "index": self.frames + np.arange(count),
-            "task_index": np.zeros(count, np.int64),
-        }
+        count = len(self.chosen.frames(number))
+        columns = self._columns(number, count)
         stats = {name: vector_stats(values.reshape(count, -1)) for name, values in columns.items()}
-        row: dict[str, Any] = {"episode_index": episode, "tasks": [self.task], "length": count}
+        row: dict[str, Any] = {"episode_index": len(self.rows), "tasks": [self.task], "length": count}
         row |= self.table.columns("data")
         row |= {"dataset_from_index": self.frames, "dataset_to_index": self.frames + count}
-        for name, video in self.videos.items():
-            pictures = PictureStats(count)
-            video.begin()
-            for picture in chosen.pictures(number, name, labels=False):
-                video.add(picture.image)
-                pictures.add(picture.image)
-            row |= video.end()
-            stats[_image_key(name)] = pictures.stats()
+        for name in self.videos:
+            place, stats[_image_key(name)] = self._film(number, name, count)
+            row |= place
         row |= {f"stats/{key}/{name}": value for key, found in stats.items() for name, value in found.items()}
         row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         self.rows.append(row)
@@ -125,6 +110,28 @@ class _Writer:
         self.waiting.append(columns)
         if sum(values.nbytes for part in self.waiting for values in part.values()) > MAX_TABLE_BYTES:
             self._flush()
+
+    def _columns(self, number: int, count: int) -> dict[str, np.ndarray]:
+        """Return the columns of a rollout's table."""
+        reader, every = self.chosen.reader, self.chosen.every
+        return {
+            "observation.state": reader.read(number, "obs/object")[::every].astype(np.float32),
+            "action": reader.read(number, "actions")[::every].astype(np.float32),
+            "timestamp": (np.arange(count) / float(self.rate)).astype(np.float32),
+            "frame_index": np.arange(count),
+            "episode_index": np.full(count, len(self.rows)),
+            "index": self.frames + np.arange(count),
+            "task_index": np.zeros(count, np.int64),
+        }
+
+    def _film(self, number: int, camera: str, count: int) -> tuple[dict[str, Any], Stats]:
+        """Add a rollout to the video of a camera; return where it stands there, and the statistics of its pictures."""
+        video, pictures = self.videos[camera], PictureStats(count)
+        video.begin()
+        for picture in self.chosen.pictures(number, camera, labels=False):
+            video.add(picture.image)
+            pictures.add(picture.image)
+        return video.end(), pictures.stats()
 
     def finish(self) -> None:
         """Write the tables, the statistics and `info.json`."""

@@ -115,14 +115,19 @@ def _require_names(model: Model) -> None:
             "rename one in the capture.",
         )
     for one in model.file.articulations:
-        inside = [*one.links, *joint_names(one).values()]
-        wrong = [name for name in inside if inside.count(name) > 1] + [name for name in inside if _reserved(name)]
-        if wrong:
-            raise InputDataError(
-                f"{model.place}: '{wrong[0]}' of the jointed body '{one.name}' cannot be a name in SDF.",
-                "names of links and joints that differ; none is 'world' or begins and ends with two underscores.",
-                "rename it in the URDF or MJCF of the capture.",
-            )
+        _require_inner_names(model, one)
+
+
+def _require_inner_names(model: Model, one: ArticulationModel) -> None:
+    """Refuse names of links and joints that SDF cannot have."""
+    inside = [*one.links, *joint_names(one).values()]
+    wrong = [name for name in inside if inside.count(name) > 1] + [name for name in inside if _reserved(name)]
+    if wrong:
+        raise InputDataError(
+            f"{model.place}: '{wrong[0]}' of the jointed body '{one.name}' cannot be a name in SDF.",
+            "names of links and joints that differ; none is 'world' or begins and ends with two underscores.",
+            "rename it in the URDF or MJCF of the capture.",
+        )
 
 
 def _reserved(name: str) -> bool:
@@ -192,27 +197,35 @@ def _link(
     model: Model, body: BodyModel, name: str, meshes: Mapping[str, ObjectModel], laws: _Laws, kinematic: bool
 ) -> ET.Element:
     link = ET.Element("link", name=name)
-    inertial = ET.SubElement(link, "inertial")
-    _pose(inertial, np.asarray(body.com_m, float))
-    _text(inertial, "mass", [body.mass_kg])
-    inertia = ET.SubElement(inertial, "inertia")
-    for key, value in moments_of(body).items():
-        _text(inertia, key, value)
+    _add_inertia(link, body)
     if kinematic:
         _text(link, "kinematic", "true")
     mesh = meshes.get(body.name)
     if mesh is not None:
-        visual = ET.SubElement(link, "visual", name="visual")
-        _add_geometry(visual, ("mesh", {"uri": f"meshes/{body.name}.obj"}))
-        material = ET.SubElement(visual, "material")
-        for light in ("ambient", "diffuse"):
-            _text(material, light, mean_color(mesh))
+        _add_visual(link, body, mesh)
     for k, (center, radius) in enumerate(spheres_of(model, body)):
         collision = ET.SubElement(link, "collision", name=f"sphere_{k}")
         _pose(collision, center)
         _add_geometry(collision, ("sphere", {"radius": numbers_text([radius])}))
         laws(body.material)(collision)
     return link
+
+
+def _add_inertia(link: ET.Element, body: BodyModel) -> None:
+    inertial = ET.SubElement(link, "inertial")
+    _pose(inertial, np.asarray(body.com_m, float))
+    _text(inertial, "mass", [body.mass_kg])
+    inertia = ET.SubElement(inertial, "inertia")
+    for key, value in moments_of(body).items():
+        _text(inertia, key, value)
+
+
+def _add_visual(link: ET.Element, body: BodyModel, mesh: ObjectModel) -> None:
+    visual = ET.SubElement(link, "visual", name="visual")
+    _add_geometry(visual, ("mesh", {"uri": f"meshes/{body.name}.obj"}))
+    material = ET.SubElement(visual, "material")
+    for light in ("ambient", "diffuse"):
+        _text(material, light, mean_color(mesh))
 
 
 def _joint(joint: JointModel, name: str) -> ET.Element:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,19 +62,7 @@ class Selection:
             raise UsageError(f"--every {every}: no step from frame to frame.", "1 or more.", "pass a positive number.")
         self.every = every
         there = self.reader.cameras()
-        if not there:
-            raise InputDataError(
-                f"{path}: this dataset has states and no images.",
-                "a dataset whose model has visual spheres.",
-                "fit the model to photos, and synthesize again.",
-            )
-        for name in cameras or ():
-            if name not in there:
-                raise UsageError(
-                    f"{path} has no camera '{name}'.{did_you_mean(name, there)}",
-                    ", ".join(there),
-                    "name one of these with --cameras.",
-                )
+        _require_cameras(path, there, cameras or ())
         self.cameras = tuple(cameras or there)
 
     def __len__(self) -> int:
@@ -156,3 +144,20 @@ class Selection:
             return None
         bits = self.reader.read(number, key, start, stop)
         return np.stack([(bits >> body) & 1 for body in range(len(self.bodies(number)))], axis=1).astype(bool)
+
+
+def _require_cameras(path: Path, there: Sequence[str], wanted: Sequence[str]) -> None:
+    """Refuse a dataset without images, and cameras that it does not have."""
+    if not there:
+        raise InputDataError(
+            f"{path}: this dataset has states and no images.",
+            "a dataset whose model has visual spheres.",
+            "fit the model to photos, and synthesize again.",
+        )
+    for name in wanted:
+        if name not in there:
+            raise UsageError(
+                f"{path} has no camera '{name}'.{did_you_mean(name, there)}",
+                ", ".join(there),
+                "name one of these with --cameras.",
+            )

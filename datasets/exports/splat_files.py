@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..io.atomic import new_directory
@@ -59,16 +61,22 @@ def in_world(model: Model, poses: dict[str, tuple[np.ndarray, np.ndarray]] | Non
 
 def _joined(parts: list[Splats]) -> Splats:
     fields = ("means", "scales", "opacities", "colors")
-    terms = max((part.harmonics.shape[1] for part in parts if part.harmonics is not None), default=0)
-    harmonics = None
-    if terms:
-        zeros = [np.zeros((len(part), terms, 3)) for part in parts]
-        for zero, part in zip(zeros, parts, strict=True):
-            if part.harmonics is not None:
-                zero[:, : part.harmonics.shape[1]] = part.harmonics
-        harmonics = np.concatenate(zeros)
     # unknown normals are written as zeros
     normals = [np.zeros((len(part), 3)) if part.normals is None else part.normals for part in parts]
     some = any(part.normals is not None for part in parts)
     joined = [np.concatenate([np.asarray(getattr(part, name)) for part in parts]) for name in fields]
-    return Splats(*joined, normals=np.concatenate(normals) if some else None, harmonics=harmonics)
+    return Splats(*joined, normals=np.concatenate(normals) if some else None, harmonics=_joined_harmonics(parts))
+
+
+def _joined_harmonics(parts: list[Splats]) -> NDArray[Any] | None:
+    """Return the harmonics of all spheres, those of a lower degree padded with zeros; None where no part has any."""
+    terms = max((part.harmonics.shape[1] for part in parts if part.harmonics is not None), default=0)
+    if not terms:
+        return None
+    padded = np.zeros((sum(map(len, parts)), terms, 3))
+    first = 0
+    for part in parts:
+        if part.harmonics is not None:
+            padded[first : first + len(part), : part.harmonics.shape[1]] = part.harmonics
+        first += len(part)
+    return padded

@@ -161,8 +161,7 @@ def _link(model: Model, body: BodyModel, meshes: Mapping[str, ObjectModel]) -> E
 
 
 def _joint(joint: JointModel) -> ET.Element:
-    lower, upper = joint.lower, joint.upper
-    endless = lower is None and upper is None
+    endless = joint.lower is None and joint.upper is None
     kinds = {"hinge": "continuous" if endless else "revolute", "slide": "prismatic", "fixed": "fixed"}
     made = ET.Element("joint", name=joint.name, type=kinds[joint.kind])
     ET.SubElement(made, "parent", link=joint.parent)
@@ -173,15 +172,18 @@ def _joint(joint: JointModel) -> ET.Element:
     axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
     ET.SubElement(made, "axis", xyz=numbers_text(axis))
     ET.SubElement(made, "dynamics", damping=numbers_text([joint.damping]), friction=numbers_text([joint.friction]))
+    ET.SubElement(made, "limit", _limits(joint, kinds[joint.kind] == "continuous"))
+    return made
+
+
+def _limits(joint: JointModel, endless: bool) -> dict[str, str]:
+    """Return the attributes of <limit>, in which an absent number is a large one."""
     effort = joint.torque_limit if joint.torque_limit is not None else (FAR if joint.stiffness > 0 else 0.0)
     limits = {"effort": numbers_text([effort]), "velocity": numbers_text([FAST])}
-    if kinds[joint.kind] != "continuous":
-        limits |= {
-            "lower": numbers_text([-FAR if lower is None else lower]),
-            "upper": numbers_text([FAR if upper is None else upper]),
-        }
-    ET.SubElement(made, "limit", limits)
-    return made
+    if endless:
+        return limits
+    lower, upper = (far if end is None else end for far, end in ((-FAR, joint.lower), (FAR, joint.upper)))
+    return limits | {"lower": numbers_text([lower]), "upper": numbers_text([upper])}
 
 
 def _add_scene(root: ET.Element, model: Model) -> None:

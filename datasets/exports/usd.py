@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import ArticulationModel, BodyModel, ContactParameters, InputDataError, JointModel, UsageError
-from ...schemas.surfaces import Surface
+from ...schemas.surfaces import CylinderShape, Surface
 from ..models.model import Model
 from ..shapes.turns import quat_of_matrix, quat_of_normal, quat_product
 from .bop_models import ObjectModel
@@ -217,11 +217,7 @@ class _Writer:
         elif surface.half_space is not None:
             prim = self._plane(path)
         elif surface.cylinder is not None:
-            shape = self.geom.Cylinder.Define(self.stage, path)
-            shape.CreateAxisAttr(self.geom.Tokens.z)
-            shape.CreateRadiusAttr(surface.cylinder.radius_m)
-            shape.CreateHeightAttr(2 * surface.cylinder.half_length_m)
-            prim = shape.GetPrim()
+            prim = self._cylinder(path, surface.cylinder)
         else:
             half = surface.box.half_extents_m if surface.box is not None else (*self._sheet(surface), SHEET_M)
             shape = self.geom.Cube.Define(self.stage, path)
@@ -231,6 +227,13 @@ class _Writer:
         if surface.box is None and surface.rectangle is None:
             self._place(self.geom.Xformable(prim), place, quat)
         self._collides(prim, surface.material)
+
+    def _cylinder(self, path: str, cylinder: CylinderShape) -> Any:
+        shape = self.geom.Cylinder.Define(self.stage, path)
+        shape.CreateAxisAttr(self.geom.Tokens.z)
+        shape.CreateRadiusAttr(cylinder.radius_m)
+        shape.CreateHeightAttr(2 * cylinder.half_length_m)
+        return shape.GetPrim()
 
     @staticmethod
     def _sheet(surface: Surface) -> tuple[float, float]:
@@ -260,11 +263,7 @@ class _Writer:
         root = self.stage.GetPrimAtPath(self.paths[one.root])
         self.physics.ArticulationRootAPI.Apply(root)
         if one.base == "fixed":
-            fixed = self.physics.FixedJoint.Define(self.stage, f"{self.paths[one.root]}/in_world")
-            place, quat = self._pose(self.model.body(one.root))
-            fixed.CreateBody1Rel().SetTargets([self.paths[one.root]])
-            fixed.CreateLocalPos0Attr(self._vec3f(place))
-            fixed.CreateLocalRot0Attr(self._quatf(quat))
+            self._hold(one.root)
         elif one.base == "driven":
             self.physics.RigidBodyAPI(root).CreateKinematicEnabledAttr(True)
         for joint in one.joints:
@@ -275,6 +274,14 @@ class _Writer:
                 pairs = self.physics.FilteredPairsAPI.Apply(self.stage.GetPrimAtPath(self.paths[first]))
                 pairs.CreateFilteredPairsRel().SetTargets(others)
         return len(one.joints)
+
+    def _hold(self, root: str) -> None:
+        """Fix a body to the world at its place."""
+        fixed = self.physics.FixedJoint.Define(self.stage, f"{self.paths[root]}/in_world")
+        place, quat = self._pose(self.model.body(root))
+        fixed.CreateBody1Rel().SetTargets([self.paths[root]])
+        fixed.CreateLocalPos0Attr(self._vec3f(place))
+        fixed.CreateLocalRot0Attr(self._quatf(quat))
 
     def _joint(self, joint: JointModel) -> None:
         path = f"{self.paths[joint.link]}/{prim_name(joint.name)}_joint"
@@ -291,6 +298,9 @@ class _Writer:
         if joint.kind == "fixed":
             return
         made.CreateAxisAttr(self.physics.Tokens.x)
+        self._limits_and_drive(made, joint)
+
+    def _limits_and_drive(self, made: Any, joint: JointModel) -> None:
         unit = np.degrees(1.0) if joint.kind == "hinge" else 1.0
         if joint.lower is not None:
             made.CreateLowerLimitAttr(float(joint.lower * unit))

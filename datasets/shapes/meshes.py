@@ -65,6 +65,16 @@ def read_mesh(path: Path | str, merge: bool = True) -> Mesh:
         InputDataError: If it is missing, cut off, empty or holds numbers that are not finite.
     """
     path = Path(path)
+    mesh = _parsed(path, merge)
+    if len(mesh.faces) == 0:
+        raise InputDataError(f"{path}: the mesh has no triangles.", "a mesh with faces, not points alone.", _EXPORT)
+    if not np.isfinite(mesh.vertices).all():
+        raise InputDataError(f"{path}: the mesh has vertices that are not finite.", todo=_EXPORT)
+    return mesh
+
+
+def _parsed(path: Path, merge: bool) -> Mesh:
+    """Return what a file says, by its suffix."""
     readers = {".obj": _read_obj, ".stl": _read_stl}
     if path.suffix.lower() not in readers:
         raise InputDataError(
@@ -75,15 +85,9 @@ def read_mesh(path: Path | str, merge: bool = True) -> Mesh:
     data = read_binary_file(path, MOST_BYTES)
     try:
         mesh = readers[path.suffix.lower()](data)
-        if merge or path.suffix.lower() == ".stl":
-            mesh = _merged(mesh)
+        return _merged(mesh) if merge or path.suffix.lower() == ".stl" else mesh
     except (ValueError, IndexError, OverflowError) as error:
         raise InputDataError(f"{path}: no mesh that can be read: {str(error)[:200]}.", todo=_EXPORT) from None
-    if len(mesh.faces) == 0:
-        raise InputDataError(f"{path}: the mesh has no triangles.", "a mesh with faces, not points alone.", _EXPORT)
-    if not np.isfinite(mesh.vertices).all():
-        raise InputDataError(f"{path}: the mesh has vertices that are not finite.", todo=_EXPORT)
-    return mesh
 
 
 def mass_properties(mesh: Mesh, path: Path | str = "mesh") -> SolidProperties:
@@ -237,15 +241,20 @@ def _read_stl(data: bytes) -> Mesh:
         record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
         corners = np.frombuffer(data, record, count, 84)["corners"].astype(np.float64)
     elif data[:5] == b"solid":
-        words = [line.split() for line in data.decode("utf-8", "replace").splitlines()]
-        listed = [[number_of(number) for number in word[1:4]] for word in words if word[:1] == ["vertex"]]
-        corners = np.array(listed, np.float64)
-        if len(corners) % 3 or not any(word[:1] == ["endsolid"] for word in words):
-            raise ValueError("it is cut off")
+        corners = _stl_corners(data.decode("utf-8", "replace"))
     else:
         raise ValueError(f"{len(data)} bytes for {count} triangles; it is cut off or no .stl")
     corners = corners.reshape(-1, 3)
     return Mesh(corners, np.arange(len(corners)).reshape(-1, 3))
+
+
+def _stl_corners(text: str) -> Array:
+    """Return the corners (3 F, 3) of the triangles of an .stl in text."""
+    words = [line.split() for line in text.splitlines()]
+    listed = [[number_of(number) for number in word[1:4]] for word in words if word[:1] == ["vertex"]]
+    if len(listed) % 3 or not any(word[:1] == ["endsolid"] for word in words):
+        raise ValueError("it is cut off")
+    return np.array(listed, np.float64)
 
 
 def _merged(mesh: Mesh) -> Mesh:

@@ -96,6 +96,17 @@ def write_splats(
         sh_degree: Pad the colours with zeros up to this degree, if they have less; INRIA's own loader wants 3.
         overwrite: Replace an existing file.
     """
+    names, table = _table(splats, sh_degree)
+    if not np.isfinite(table).all():
+        raise ValueError("spheres with values that are not finite, or with a scale of 0, cannot be written")
+    header = ["ply", "format binary_little_endian 1.0", "comment unit metre", f"comment frame {frame}"]
+    header += [f"element vertex {len(splats)}", *(f"property float {name}" for name in names), "end_header"]
+    with new_file(path, "splat file", overwrite) as temporary:
+        temporary.write_bytes(("\n".join(header) + "\n").encode("ascii") + table.tobytes())
+
+
+def _table(splats: Splats, sh_degree: int) -> tuple[list[str], NDArray[np.float32]]:
+    """Return the names of the properties of a file, and their values (N, P); see `write_splats`."""
     higher = np.zeros((len(splats), 0, 3)) if splats.harmonics is None else np.asarray(splats.harmonics)
     terms = max((sh_degree + 1) ** 2 - 1, higher.shape[1])
     rest = 3 * terms
@@ -114,12 +125,7 @@ def write_splats(
     table[:, column["opacity"]] = np.log(opacities / (1 - opacities))
     table[:, column["scale_0"] : column["scale_2"] + 1] = np.log(np.asarray(splats.scales, np.float64))[:, None]
     table[:, column["rot_0"]] = 1.0
-    if not np.isfinite(table).all():
-        raise ValueError("spheres with values that are not finite, or with a scale of 0, cannot be written")
-    header = ["ply", "format binary_little_endian 1.0", "comment unit metre", f"comment frame {frame}"]
-    header += [f"element vertex {len(splats)}", *(f"property float {name}" for name in names), "end_header"]
-    with new_file(path, "splat file", overwrite) as temporary:
-        temporary.write_bytes(("\n".join(header) + "\n").encode("ascii") + table.tobytes())
+    return names, table
 
 
 def read_splats(path: Path | str, harmonics: bool = False) -> Splats:
@@ -138,6 +144,21 @@ def read_splats(path: Path | str, harmonics: bool = False) -> Splats:
     _require_metres(path, comments)
     table = _finite_columns(path, columns)
     log_scales = np.stack([table[f"scale_{k}"] for k in range(3)], axis=1)
+    _require_spheres(path, log_scales)
+    colors = 0.5 + SH_C0 * np.stack([table[f"f_dc_{k}"] for k in range(3)], axis=1)
+    higher = _harmonics(path, columns) if harmonics else None
+    return Splats(
+        means=np.stack([table[axis] for axis in "xyz"], axis=1),
+        scales=np.exp(log_scales.mean(axis=1)),
+        opacities=1 / (1 + np.exp(-table["opacity"])),
+        colors=np.clip(colors, 0.0, 1.0) if higher is None else colors,
+        normals=_unit_normals(columns),
+        harmonics=higher,
+    )
+
+
+def _require_spheres(path: Path, log_scales: Array) -> None:
+    """Refuse splats whose three scales differ, or lie far beyond what can be seen."""
     uneven = int(np.count_nonzero(np.ptp(log_scales, axis=1) > _ISOTROPY_TOLERANCE))
     if uneven:
         raise InputDataError(
@@ -152,16 +173,6 @@ def read_splats(path: Path | str, harmonics: bool = False) -> Splats:
             f"-{_MOST_LOG_SCALE:g} to {_MOST_LOG_SCALE:g}.",
             "train the splats again, or remove these.",
         )
-    colors = 0.5 + SH_C0 * np.stack([table[f"f_dc_{k}"] for k in range(3)], axis=1)
-    higher = _harmonics(path, columns) if harmonics else None
-    return Splats(
-        means=np.stack([table[axis] for axis in "xyz"], axis=1),
-        scales=np.exp(log_scales.mean(axis=1)),
-        opacities=1 / (1 + np.exp(-table["opacity"])),
-        colors=np.clip(colors, 0.0, 1.0) if higher is None else colors,
-        normals=_unit_normals(columns),
-        harmonics=higher,
-    )
 
 
 def _require_metres(path: Path, comments: list[str]) -> None:
@@ -228,13 +239,7 @@ def _read_vertices(path: Path) -> tuple[dict[str, Array], list[str]]:
     body = data.find(b"\n", end) + 1
     kind, count, properties, comments = _parse_header(path, data[:end].decode("ascii", "replace"))
     if kind == "ascii":
-        try:
-            words = np.array(data[body:].split()[: count * len(properties)], np.float64)
-        except ValueError as error:
-            raise InputDataError(f"{path}: a value that is no number: {str(error)[:80]}.", todo=_AGAIN) from None
-        if len(words) < count * len(properties):
-            raise _cut_off(path, count)
-        rows = words.reshape(count, len(properties))
+        rows = _ascii_rows(path, data[body:], count, len(properties))
         return {name: rows[:, k] for k, (name, _) in enumerate(properties)}, comments
     order = "<" if kind == "binary_little_endian" else ">"
     dtype = np.dtype([(name, order + code) for name, code in properties])
@@ -242,6 +247,17 @@ def _read_vertices(path: Path) -> tuple[dict[str, Array], list[str]]:
         raise _cut_off(path, count)
     table = np.frombuffer(data, dtype, count, body)
     return {name: table[name] for name, _ in properties}, comments
+
+
+def _ascii_rows(path: Path, data: bytes, count: int, width: int) -> Array:
+    """Return the numbers (count, width) of a text."""
+    try:
+        words = np.array(data.split()[: count * width], np.float64)
+    except ValueError as error:
+        raise InputDataError(f"{path}: a value that is no number: {str(error)[:80]}.", todo=_AGAIN) from None
+    if len(words) < count * width:
+        raise _cut_off(path, count)
+    return words.reshape(count, width)
 
 
 def _cut_off(path: Path, count: int) -> InputDataError:
@@ -263,15 +279,19 @@ def _parse_header(path: Path, text: str) -> tuple[str, int, list[tuple[str, str]
         if kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
             raise ValueError(f"its format is '{kind}'")
         count, properties = _vertices(lines)
-        names = [name for name, _ in properties]
-        if not names:
-            raise ValueError("its splats have no properties")
-        twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
-        if twice is not None:
-            raise ValueError(f"the property '{twice}' stands twice")
+        _require_distinct([name for name, _ in properties])
     except (ValueError, KeyError, IndexError) as error:
         raise InputDataError(f"{path}: the .ply header cannot be read: {_reason(error)}.", _HEADER, _AGAIN) from None
     return kind, count, properties, comments
+
+
+def _require_distinct(names: list[str]) -> None:
+    """Raise ValueError for properties of which there is none, or one twice."""
+    if not names:
+        raise ValueError("its splats have no properties")
+    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    if twice is not None:
+        raise ValueError(f"the property '{twice}' stands twice")
 
 
 def _reason(error: Exception) -> str:

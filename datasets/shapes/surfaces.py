@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -140,13 +141,9 @@ def _heights(path: Path) -> Array:
     """Return the numbers of a .npy (R, C), or the brightness of a grey picture, 0 to 1."""
     if path.suffix.lower() == ".npy":
         grid = read_npy(path)
-        good = grid.ndim == 2 and min(grid.shape, default=0) >= 2 and grid.dtype.kind in "fiu"
         found, white = f"{grid.dtype} {grid.shape}", 1.0
     elif path.suffix.lower() == ".png":
-        grid = cv2.imdecode(np.frombuffer(read_binary_file(path), np.uint8), cv2.IMREAD_UNCHANGED)
-        if grid is None:
-            raise InputDataError(f"{path}: the picture does not decode.", todo="export the height field again.")
-        good = grid.ndim == 2 and min(grid.shape, default=0) >= 2
+        grid = _picture(path)
         found, white = f"a picture of shape {grid.shape}", float(np.iinfo(grid.dtype.name).max)
     else:
         raise InputDataError(
@@ -154,13 +151,21 @@ def _heights(path: Path) -> Array:
             ".png or .npy.",
             "save the heights as .npy or .npz.",
         )
-    if not good:
+    if not (grid.ndim == 2 and min(grid.shape, default=0) >= 2 and grid.dtype.kind in "fiu"):
         raise InputDataError(
             f"{path}: {found}.",
             "a grey picture, or numbers in rows and columns, at least 2 x 2.",
             "correct the file, or take the original.",
         )
     return grid.astype(float) / white
+
+
+def _picture(path: Path) -> NDArray[Any]:
+    """Return the pixels of a picture as they are stored."""
+    pixels = cv2.imdecode(np.frombuffer(read_binary_file(path), np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise InputDataError(f"{path}: the picture does not decode.", todo="export the height field again.")
+    return pixels
 
 
 def _height_field(shape: HeightFieldShape, path: Path) -> Mesh:
