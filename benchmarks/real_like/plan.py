@@ -30,6 +30,7 @@ Stage = Literal[
     "report12",
     "report13",
     "report14",
+    "report15",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on `development` alone. Each report stage is read once, after everything is fixed: the first

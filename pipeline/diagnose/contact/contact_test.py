@@ -65,6 +65,8 @@ class Bar:
     """Size of the largest parameter, in usual sizes."""
     without_best: float = -math.inf
     """Fall of chi2 without the episode in which it falls most."""
+    without_share: float = 0.0
+    """The same as a share of the score."""
     gain_t: float | None = None
     """Mean gain of held-out episodes in its standard errors, which then has to be positive; None demands no gain."""
     carriers: int = 0
@@ -77,7 +79,8 @@ class Bar:
         """Return whether the evidence reaches the minima."""
         predicts = self.gain_t is None or (one.gain > 0 and one.gain_t >= self.gain_t)
         enough = one.score >= self.score and one.share >= self.share and one.size >= self.size
-        return enough and one.without_best >= self.without_best and predicts and self._carried(one)
+        others = max(self.without_best, self.without_share * one.score)
+        return enough and one.without_best >= others and predicts and self._carried(one)
 
     def _carried(self, one: Evidence) -> bool:
         """Return whether enough held-out episodes carry the effect; True where their gains were not computed."""

@@ -120,6 +120,7 @@ class SlidingTest(ContactTest):
             carriers=min(parameters + 1, self.limits.carriers),
             carries=self.limits.carries,
             without_best=self.limits.without_best if data.flown else -math.inf,
+            without_share=self.limits.without_share if best.gains else 0.0,
             gain_t=self.limits.gain_t if best.gains else None,
         )
         pressed = best.name in self.limits.as_friction

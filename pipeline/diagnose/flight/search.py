@@ -2,7 +2,8 @@
 
 A score may be significant where an effect only compensates an error in the law of another: an isotropic drag of a box
 leaves a small residual that a shifted centre of mass fits. A second effect therefore has to improve held-out
-predictions and to explain most of the residual; otherwise the residual stays unexplained.
+predictions, and to explain most of the residual or to repeat from episode to episode beside their scatter; otherwise
+the residual stays unexplained.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from ...segments.prepare import Prepared
 from ...segments.segment_states import fit_states
 from ...segments.segments import Segments
 from ..evidence.cross_validation import held_out_loss
-from ..evidence.effect_selection import SelectionStep, select_next
+from ..evidence.effect_selection import SelectionStep, repeats, select_next
 from ..thresholds import THRESHOLDS
 from .coupled_effects import DRAGS, drag_in_wind
 
@@ -70,7 +71,7 @@ def _forward_selection(
         before = steps[-1].best.refitted if steps else None
         if before is not None:
             excess = before.cost - float(flight.dof.sum()) * scatter
-            if before.cost - refitted.cost < LIMITS.share * excess:
+            if before.cost - refitted.cost < LIMITS.share * excess and not _is_sure(step):
                 break
             losses = losses or [held_out_loss(flight, current)]
             losses.append(held_out_loss(refitted.segments[0], refitted.world))
@@ -79,6 +80,15 @@ def _forward_selection(
         steps.append(step)
         current, flight = refitted.world, refitted.segments[0]
     return steps, losses, current, flight
+
+
+def _is_sure(step: SelectionStep) -> bool:
+    """Return whether an effect repeats from episode to episode, whatever else is left.
+
+    What the first effect's law misses differs with each motion, and bursts or tilts of single episodes, which are most
+    of what is left in tracks of real systems, ask for no more effects.
+    """
+    return repeats(step.best, len(step.evidence))
 
 
 def reselected(

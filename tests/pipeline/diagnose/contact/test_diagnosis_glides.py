@@ -196,6 +196,10 @@ def test_what_a_single_episode_says_is_not_named_beside_an_effect_of_flight() ->
     assert named_in_sliding([alone], flown=True) == []
     assert named_in_sliding([twice], flown=True) == [twice]
     assert named_in_sliding([alone], flown=False) == [alone]  # no law from flight can be off
+    # a misfit of one episode is one error, where the slides of others tell
+    gains = (300.0, 40.0, 30.0, 30.0)
+    assert named_in_sliding([replace(alone, gains=gains)], flown=False) == []
+    assert [one.name for one in named_in_sliding([replace(twice, gains=gains)], flown=False)] == [told.name]
 
 
 def test_evidence_tells_what_the_other_episodes_say() -> None:
