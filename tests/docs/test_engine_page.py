@@ -1,4 +1,4 @@
-"""The page of the engine table, and the draft of a capture's motions."""
+"""The page of the engine table, the chart of the error budget, and the draft of a capture's motions."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))  # as `python benchmarks/engine_page.py` has it
 try:
+    import budget_page
     import engine_page
     from tabletop.draft import Draft
 finally:
@@ -31,6 +32,18 @@ def row(name: str, seed: int, errors_mm: list[float], commit: str = "abc") -> di
 def test_the_page_is_that_of_the_stored_rows() -> None:
     stored = engine_page.page(engine_page.read(engine_page.STORED))
     assert engine_page.PAGE.read_text(encoding="utf-8") == stored
+
+
+def test_the_budget_is_that_of_the_stored_rows() -> None:
+    rows = [budget_page.json.loads(line) for line in budget_page.STORED.read_text(encoding="utf-8").splitlines()]
+    assert budget_page.table(rows) in (budget_page.CHART.parent / "error-budget.md").read_text(encoding="utf-8")
+    assert budget_page.CHART.read_text(encoding="utf-8") == budget_page.chart(rows)
+
+
+def test_a_true_part_changes_what_it_changes() -> None:
+    errors = [{"fitted": [[10.0, 2.0], [12.0, 4.0]], "shape": [[7.0, 5.0], [9.0, 7.0 + k]]} for k in range(3)]
+    assert budget_page.change([{"errors": one} for one in errors], "shape", 0) == (-3.0, -3.0, -3.0)
+    assert budget_page.change([{"errors": one} for one in errors], "shape", 1) == (3.5, 3.0, 4.0)
 
 
 def test_rows_are_reduced_and_replaced(tmp_path: Path) -> None:
