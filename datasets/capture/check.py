@@ -27,7 +27,7 @@ _UNREAD = {
     "tracks": ((".tsv", ".xls", ".xlsx", ".ods"), ".csv.", "convert it, or see 'cgwm import'."),
     "images": (_UNREAD_IMAGES, ".jpg and .png.", "convert it, for example: magick mogrify -format jpg FILE"),
     "masks": (_UNREAD_IMAGES, ".png.", "convert it without loss."),
-    "videos": ((".mov", ".avi", ".mkv", ".m4v"), ".mp4, .webm, or a directory of frames.", "convert it with ffmpeg."),
+    "videos": ((".avi", ".mkv", ".m4v"), ".mp4, .mov, .webm, or a directory of frames.", "convert it with ffmpeg."),
 }
 """Suffixes that are not read, in lower case, by folder; which are, and what to do."""
 _READ = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES, ".csv", ".npy")

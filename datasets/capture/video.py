@@ -1,4 +1,4 @@
-"""Reading and writing of videos: a directory of numbered frames, or an mp4 or webm file."""
+"""Reading and writing of videos: a directory of numbered frames, or an mp4, mov or webm file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..io.atomic import temporary_directory
 from .files import entries_of
 from .images import IMAGE_SUFFIXES, image_size, read_label, read_rgb
 
-VIDEO_SUFFIXES = (".mp4", ".webm")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".webm")
 """Suffixes of readable video files."""
 _HEAD_BYTES = 4096
 
@@ -242,6 +242,6 @@ def _count(path: Path) -> int:
 def _undecodable(path: Path) -> InputDataError:
     return InputDataError(
         f"{path}: the video does not decode.",
-        "mp4 or webm, or a directory of frames.",
+        "mp4, mov or webm, or a directory of frames.",
         "convert it, for example into frames: ffmpeg -i VIDEO -start_number 0 %06d.png",
     )

@@ -185,8 +185,9 @@ def test_unknown_names_are_answered_with_the_nearest(root: Path) -> None:
         capture.video_path("left", "00")
 
 
-def test_video_file(root: Path) -> None:
-    path = root / "videos" / "right" / "000.mp4"
+@pytest.mark.parametrize("suffix", ["mp4", "mov"])
+def test_video_file(root: Path, suffix: str) -> None:
+    path = root / "videos" / "right" / f"000.{suffix}"
     path.parent.mkdir()
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 20.0, (64, 48))
     for k in range(5):
@@ -203,7 +204,7 @@ def test_video_file(root: Path) -> None:
     warnings = check_capture(Capture.open(root)).warnings
     assert warnings == [f"{path}: the file says 20 frames/s; capture.toml's 240 is used."]
     path.write_bytes(path.read_bytes()[:100])
-    assert "C/videos/right/000.mp4: the video does not decode." in fault(root)
+    assert f"C/videos/right/000.{suffix}: the video does not decode." in fault(root)
 
 
 def test_other_splits_are_not_opened(root: Path) -> None:
@@ -480,7 +481,7 @@ def test_misspelt_field_in_cameras_json(root: Path) -> None:
     [
         ("images/IMG_1.HEIC", "C/images/IMG_1.HEIC: .HEIC is not read.\nAllowed: .jpg and .png."),
         ("masks/a.tif", "C/masks/a.tif: .tif is not read.\nAllowed: .png."),
-        ("videos/left/002.MOV", "C/videos/left/002.MOV: .MOV is not read.\nAllowed: .mp4, .webm, or a directory"),
+        ("videos/left/002.AVI", "C/videos/left/002.AVI: .AVI is not read.\nAllowed: .mp4, .mov, .webm, or a directory"),
     ],
 )
 def test_no_photo_or_video_is_passed_over_in_silence(root: Path, name: str, expected: str) -> None:
