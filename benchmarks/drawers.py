@@ -33,6 +33,8 @@ from scipy.spatial.transform import Rotation
 
 HALF_M, CASE_M, RADIUS_M = (0.15, 0.15, 0.05), 0.3, 0.01
 STEP_S, MUJOCO_STEP_S = 2e-5, 1e-4
+SPRING_S, SPRING_DAMPING = 0.01, 0.2
+"""Contact time and damping ratio of a spring."""
 REST_S = 0.4
 """How long the finger stays after its motion."""
 
@@ -133,8 +135,8 @@ def by_hand(setting: Setting, push: Push) -> Motion:
     time_s = STEP_S * np.arange(count + 1)
     way, speed, acceleration = (value.tolist() for value in push.path(time_s))
     m, f, d, gap = setting.mass_kg, setting.friction_n, setting.damping_n_s_m, push.gap_m
-    k = m * (100.0 if setting.soft else 1000.0) ** 2
-    c = 2 * (0.2 if setting.soft else 1.0) * math.sqrt(k * m)
+    k = m * (1 / SPRING_S if setting.soft else 1000.0) ** 2
+    c = 2 * (SPRING_DAMPING if setting.soft else 1.0) * math.sqrt(k * m)
     q, w, rows = 0.0, 0.0, []
     for i in range(count + 1):
         deep = way[i] - gap - q
@@ -263,6 +265,8 @@ def main() -> None:
         "rail.damping": setting.damping_n_s_m / by_mass,
         "friction": setting.mu,
     }
+    if setting.kind == "spring":
+        truth |= {"contact_time_s": SPRING_S, "damping_ratio": SPRING_DAMPING}
     more = {"seed": given.seed, "kind": given.kind, "forces": forces, "cpu_s": round(time.process_time() - began, 1)}
     print_found(given.folder / "model", truth, more)
 
