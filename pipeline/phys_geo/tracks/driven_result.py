@@ -71,6 +71,8 @@ class DrivenFit:
     """What is known of each driven body and the link that it pushes."""
     record: dict[str, Any]
     """Course of the fit, for `fit.json`."""
+    open: frozenset[str] = frozenset()
+    """Names of parameters of the contact law that the motion does not tell."""
 
     def world(self, world: World) -> World:
         """Return the world with the mass that was found."""
@@ -93,7 +95,7 @@ class DrivenFit:
         What it says of them rests on how deep bodies press into each other. Values stay, as they go with the others.
         """
         known = {p.name for p in self.told().parameters}
-        open_now = {p.name for p in self.parameters} - known
+        open_now = {p.name for p in self.parameters} - known | self.open
         covariance = estimate.covariance.copy()
         for k, parameter in enumerate(estimate.parameters):
             if parameter.name in open_now:

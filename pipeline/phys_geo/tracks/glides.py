@@ -27,9 +27,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....datasets.capture.tracks import Episode
+from ....schemas.materials import of_pair
 from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
 from ...physics.chains.parameters import LOSSES, chain_parameters
-from ...physics.parameters import Parameter
+from ...physics.parameters import CONTACT_TIME, DAMPING_RATIO, GAP, Parameter, gap_parameters
 from ...physics.world import World
 from ...trajectories.initial_state import clearance
 from ...trajectories.observations import Observations
@@ -83,7 +84,26 @@ def fit_gliding_joints(world: World, episodes: Sequence[Episode], noise: Noise) 
     if parts:
         values, covariance, found = _fitted(_Parts.of(world, parameters, parts, noise))
         record |= found
-    return DrivenFit(parameters=parameters, values=values, covariance=covariance, pressed=[], record=record)
+    return DrivenFit(
+        parameters=parameters,
+        values=values,
+        covariance=covariance,
+        pressed=[],
+        record=record,
+        open=_laws_of_flat_faces(world),
+    )
+
+
+def _laws_of_flat_faces(world: World) -> frozenset[str]:
+    """Return the names of contact times and damping ratios of links and driven bodies whose size is not fitted.
+
+    Depths tell them, and a size that is off by 0.2 mm is deeper than most contacts.
+    """
+    fitted = {p.name for p in gap_parameters(world)}
+    driven = [k for k, body in enumerate(world.bodies) if body.name in world.driven]
+    flat = [k for k in driven if f"{world.bodies[k].name}.{GAP.name}" not in fitted]
+    pairs = [world.materials_of(link, k) for k in flat for link in world.tracked]
+    return frozenset(of_pair(p.name, pair) for p in (CONTACT_TIME, DAMPING_RATIO) for pair in pairs)
 
 
 def glides(world: World, episodes: Sequence[Episode]) -> list[Part]:

@@ -10,10 +10,11 @@ from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate
 from cgwm.pipeline.phys_geo.tracks.glides import fit_gliding_joints, free_runs, moves_on, roughness
 from cgwm.pipeline.physics.chains.chain import Chain, Joint
 from cgwm.pipeline.physics.chains.parameters import chain_parameters
+from cgwm.pipeline.physics.parameters import contact_parameters
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.chains import chained, link
-from helpers.worlds import F64, ball_body, law
+from helpers.worlds import F64, ball_body, law, plate_body
 
 MASS, DAMPING, FRICTION = 2.0, 4.0, 3.0
 NOISE = Noise(1e-4, 1e-3)
@@ -70,6 +71,19 @@ def test_a_drawer_that_goes_with_the_finger_tells_nothing() -> None:
     left = found.leave_open(found.told().put_in(searched, losses))
     np.testing.assert_allclose(left.values, searched.values)
     np.testing.assert_allclose(left.covariance, np.diag([p.prior[1] ** 2 for p in losses]))
+
+
+def test_a_plate_leaves_contact_time_and_damping_ratio_open() -> None:
+    """Its size is not fitted, as that of a ball is, and depths tell them."""
+    ball = fit_gliding_joints(world(), [shove(0, glides=False)], NOISE)
+    plate = replace(plate_body((0.01, 0.01, 0.01)), name="finger", motion="driven")
+    flat = replace(world(), bodies=(*world().bodies[:-1], plate))
+    found = fit_gliding_joints(flat, [shove(0, glides=False)], NOISE)
+    assert ball is not None and found is not None and not ball.open
+    names = contact_parameters(flat)
+    searched = ContactEstimate(parameters=names, values=np.zeros(len(names)), covariance=0.01 * np.eye(len(names)))
+    left = np.sqrt(np.diag(found.leave_open(searched).covariance))
+    np.testing.assert_allclose(left, [0.1, *(p.prior[1] for p in names[1:])])
 
 
 def test_worlds_that_are_left_to_the_search() -> None:
