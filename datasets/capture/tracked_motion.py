@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import Body, InputDataError
+from ..shapes.interpolation import by_column
 from ..shapes.meshes import read_mesh
 from ..shapes.ply import read_splats
 from ..shapes.turns import matrix_of
@@ -131,7 +132,7 @@ def _motion(
 def _positions(body: Body, track: Track | None, time_s: Array) -> Array | None:
     """Return the positions of a body at times (T,), or None where they are not known."""
     if track is not None:
-        return np.stack([np.interp(time_s, track.time_s, column) for column in track.position_m.T], axis=1)
+        return by_column(time_s, track.time_s, track.position_m)
     if body.motion == "fixed" and body.photo_pose is not None:
         return np.tile(body.photo_pose.position_m, (len(time_s), 1))
     return None

@@ -34,6 +34,7 @@ from ..io.atomic import new_directory
 from ..io.cells import shown
 from ..io.hdf5_files import hdf5_faults, open_hdf5, require_stored
 from ..io.outputs import reads
+from ..shapes.interpolation import by_column
 from .archives import ENDINGS, unpacked
 from .recordings import (
     Recording,
@@ -239,7 +240,7 @@ def _mlab_push(where: str, numbers: _Numbers) -> Push:
 def _at_times(time: Array, samples: Array) -> Array:
     """Return forces (K, 2) at times (K,), linear between samples (F, 3)."""
     order = np.argsort(samples[:, 0], kind="stable")
-    return np.stack([np.interp(time, samples[order, 0], samples[order, k]) for k in (1, 2)], 1)
+    return by_column(time, samples[order, 0], samples[order, 1:3])
 
 
 def _turned(quat_wxyz: Array, force: Array) -> Array:

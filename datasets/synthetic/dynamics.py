@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ..shapes.interpolation import by_column
 from .friction import CoulombFriction
 from .objects import SolidObject
 
@@ -198,7 +199,7 @@ def smooth_path(points: Array, speed: float, ramp: float, times: Array) -> tuple
     areas = np.concatenate([[np.zeros(3)], np.cumsum((corners[1:] + corners[:-1]) / 2 * np.diff(knots)[:, None], 0)])
 
     def position(at: Array) -> Array:
-        return np.stack([np.interp(at, knots, corners[:, axis]) for axis in range(3)], axis=1)
+        return by_column(at, knots, corners)
 
     def integral(at: Array) -> Array:
         index = np.searchsorted(knots, at).clip(1, len(knots) - 1) - 1

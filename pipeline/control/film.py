@@ -14,6 +14,7 @@ from ...datasets.capture.cameras import Camera
 from ...datasets.capture.video import encoded_webm
 from ...datasets.models.model import Model
 from ...datasets.rollouts.control_file import RunTables
+from ...datasets.shapes.interpolation import by_column
 from ...datasets.shapes.ply import Splats
 from ..geometry.viewpoint import look_at
 from ..rendering.contact_sheets import contact_sheet, evenly, jpeg_uri
@@ -104,8 +105,7 @@ def predicted_at(tables: RunTables, now_s: float, ahead_s: float = AHEAD_S) -> t
     if index < 0:
         return None
     times = tables.arrays["plans/times"][index]
-    pose = np.array([np.interp(now_s, times, column) for column in tables.arrays["plans/object"][index].T])
-    finger = np.array([np.interp(now_s, times, column) for column in tables.arrays["plans/targets"][index].T])
+    pose, finger = (by_column(now_s, times, tables.arrays[f"plans/{name}"][index]) for name in ("object", "targets"))
     pose[3:] /= np.linalg.norm(pose[3:])
     return pose, finger
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...datasets.shapes.interpolation import by_column
 from .horizon import Array
 from .task_world import outline
 
@@ -71,7 +72,7 @@ class PushProposals:
         times = np.append(times, times[-1] + np.linalg.norm(push) / speed)
         corners = np.concatenate((way, (begin + push)[None]))
         grid = horizon.chosen_s - horizon.chosen_s[0]
-        places = np.stack([np.interp(grid, times, column) for column in corners.T], -1)
+        places = by_column(grid, times, corners)
         return np.clip(np.diff(places, axis=0) / np.diff(grid)[:, None], -objective.bound, objective.bound)
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 from ...datasets.io.progress import note
 from ...schemas import PhaseMisfit
 from ..physics.world import World
-from ..segments.candidates import Candidate, without_effect
+from ..segments.candidates import Candidate, without_effects
 from ..segments.prepare import Prepared
 from ..segments.sliding.fit import StartedSliding
 from .contact.contact_test import ContactTest
@@ -152,9 +152,7 @@ def _without_useless(contact: ContactFindings, least: float) -> ContactFindings:
     named = {one.evidence.name for one in contact.chosen if one.where == "contact"} & present
     falls = {name: held_out_fall(contact.segments, contact.world, name) for name in named}
     useless = {name for name, fall in falls.items() if fall < least}
-    world = contact.world
-    for name in sorted(useless):
-        world = without_effect(world, name)
+    world = without_effects(contact.world, *useless)
     return replace(contact, chosen=[one for one in contact.chosen if one.evidence.name not in useless], world=world)
 
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ...datasets.capture.tracks import Track
 from ...datasets.models.mjcf import Keyframe
 from ...datasets.models.model import Model
+from ...datasets.shapes.interpolation import by_column
 from ...schemas import SamplingPlan
 from ..physics.rollout import require_finite, simulate
 from ..physics.world import State, World
@@ -160,7 +161,7 @@ def _mujoco_poses(
 def _commanded(track: Track, time_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Return position (3,) and quaternion w x y z (4,) of a command at a time; constant outside its time range."""
     now = np.clip(time_s, track.time_s[0], track.time_s[-1])
-    position = np.array([np.interp(now, track.time_s, axis) for axis in track.position_m.T])
+    position = by_column(now, track.time_s, track.position_m)
     assert track.quat_wxyz is not None  # sampled commands have orientations
     turns = Slerp(track.time_s, Rotation.from_quat(track.quat_wxyz, scalar_first=True))
     return position, turns(now).as_quat(scalar_first=True)

@@ -182,9 +182,9 @@ def _constants(variant: Variant) -> list[Parameter]:
     ]
 
 
-def without_effect(world: World, name: str) -> World:
-    """Return the world without an effect, and without the effects that act through it."""
-    left = tuple(active for active in world.effects if active.effect.name != name)
+def without_effects(world: World, *names: str) -> World:
+    """Return the world without some effects, and without those that act through them."""
+    left = tuple(active for active in world.effects if active.effect.name not in names)
     drag = any("drag" in active.effect.provides for active in left)
     return replace(world, effects=tuple(active for active in left if drag or "drag" not in active.effect.needs))
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...physics.effects.registry import CONTACT_ALIASES
 from ...physics.parameters import GROUND_SHIFT
 from ...physics.world import World
-from ...segments.candidates import base_parameters, variants_of, without_effect
+from ...segments.candidates import base_parameters, variants_of, without_effects
 from ...segments.linearization import Linearization, linearize
 from ...segments.prepare import Prepared
 from ...segments.segment_fit import Refit, refit, robust_excess
@@ -70,9 +70,7 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
     """
     flagged, after_flight = _undoubled([step for step in steps if step.flagged], after_flight)
     ambiguous = [step for step in flagged if _is_asked(step, flagged)]
-    neutral = after_flight
-    for step in ambiguous:
-        neutral = without_effect(neutral, step.best.name)
+    neutral = without_effects(after_flight, *(step.best.name for step in ambiguous))
     fitted = fitted_contact(prepared, neutral)
     if fitted is None:
         chosen = tuple(tuple(step.equals) for step in flagged)
@@ -275,7 +273,7 @@ def _replaced(world: World, old: Evidence, new: Evidence) -> World:
     if old.name == new.name or new.refitted is None:
         return world
     own = next(a for a in new.refitted.world.effects if a.effect.name == new.name)
-    return replace(world, effects=(*without_effect(world, old.name).effects, own))
+    return replace(world, effects=(*without_effects(world, old.name).effects, own))
 
 
 def _with_aliases(kept: Sequence[Evidence], equals: Sequence[Evidence]) -> list[Evidence]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...physics.parameters import Parameter, effect_parameters
 from ...physics.world import World
-from ...segments.candidates import base_parameters, base_values, without_effect
+from ...segments.candidates import base_parameters, base_values, without_effects
 from ...segments.segment_fit import linearised
 from ...segments.segment_states import fit_states
 from ...segments.segments import Segments
@@ -35,7 +35,7 @@ def held_out_errors(segments: Segments, world: World, effect: str) -> tuple[floa
         world: The world with the effect at its estimate.
         effect: Name of the effect.
     """
-    without = without_effect(world, effect)
+    without = without_effects(world, effect)
     parameters = [p for p in effect_parameters(world) if p.name.startswith(f"{effect}.")]
     with_it = segments.in_world(world)
     values = _by_others(with_it, parameters, base_values(world, parameters))
@@ -52,7 +52,7 @@ def held_out_fall(segments: Segments, world: World, effect: str) -> float:
         effect: Name of the effect.
     """
     parameters = [p for p in effect_parameters(world) if p.name.startswith(f"{effect}.")]
-    with_it, before = segments.in_world(world), segments.in_world(without_effect(world, effect))
+    with_it, before = segments.in_world(world), segments.in_world(without_effects(world, effect))
     values = _by_others(with_it, parameters, base_values(world, parameters))
     fall = _away(before, [], values.new_zeros(0)) - _away(with_it, parameters, values)
     episode = torch.tensor([item.episode for item in segments.items])

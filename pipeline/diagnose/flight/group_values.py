@@ -20,7 +20,7 @@ from ...physics.effects.effect import ActiveEffect
 from ...physics.effects.registry import load_effect
 from ...physics.parameters import Parameter, effect_parameters
 from ...physics.world import World
-from ...segments.candidates import Candidate, Variant, admissible, base_parameters, variants_of, without_effect
+from ...segments.candidates import Candidate, Variant, admissible, base_parameters, variants_of, without_effects
 from ...segments.linearization import Linearization, linearize
 from ...segments.prepare import Prepared
 from ...segments.segment_fit import refit
@@ -177,7 +177,7 @@ def _places(world: World, flight: Segments, sizes: Mapping[str, int]) -> Iterato
     """
     yield _Place(replaces=None, world=world, flight=flight, beside=sum(sizes.values()))
     for name in sizes:
-        bare = without_effect(world, name)
+        bare = without_effects(world, name)
         if len(bare.effects) == len(world.effects) - 1:
             beside = sum(sizes.values()) - sizes[name]
             yield _Place(replaces=name, world=bare, flight=fit_states(flight.in_world(bare)), beside=beside)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...optimization.tails import student_tail
 from ...physics.world import World
-from ...segments.candidates import base_parameters, base_values, without_effect
+from ...segments.candidates import base_parameters, base_values, without_effects
 from ...segments.segment_fit import projected
 from ...segments.segments import Segments
 from ..thresholds import THRESHOLDS
@@ -108,6 +108,6 @@ def _acceleration(flight: Segments, name: str, lengths: Sequence[float]) -> Tens
     if name in SCALES:
         factor = 1 + values["s"][:1, None]
         return flight.world.gravity[:1] * ((factor if name == "length_scale" else factor.pow(-2)) - 1)
-    moved = flight.positions() - flight.in_world(without_effect(flight.world, name)).positions()
+    moved = flight.positions() - flight.in_world(without_effects(flight.world, name)).positions()
     longest = int(np.argmax(lengths))
     return 2 * moved[longest, flight.lengths[longest] - 1] / lengths[longest] ** 2

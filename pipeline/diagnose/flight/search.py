@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 
 from ...physics.world import World
-from ...segments.candidates import Candidate, without_effect
+from ...segments.candidates import Candidate, without_effects
 from ...segments.prepare import Prepared
 from ...segments.segment_states import fit_states
 from ...segments.segments import Segments
@@ -112,7 +112,7 @@ def reselected(
     current, flight = found
     chosen = list(steps)
     for place, old in enumerate(steps):
-        without = without_effect(current, old.best.name)
+        without = without_effects(current, old.best.name)
         if len(without.effects) < len(current.effects) - 1:
             continue  # another effect acts through this one
         states = fit_states(flight.in_world(without))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from ...physics.parameters import effect_parameters
 from ...physics.world import World
-from ...segments.candidates import Candidate, base_parameters, without_effect
+from ...segments.candidates import Candidate, base_parameters, without_effects
 from ...segments.flights.slow_errors import SlowErrors
 from ...segments.prepare import Prepared
 from ...segments.segment_fit import refit
@@ -308,7 +308,6 @@ def _without(flight: Segments, world: World, names: set[str]) -> tuple[World, Se
     """Return the world without some effects, the others fitted again, and the segments with states fitted by it."""
     if not names:
         return world, flight
-    for name in names:
-        world = without_effect(world, name)
+    world = without_effects(world, *names)
     found = refit([flight], world, base_parameters(world, "flight"))
     return found.world, found.segments[0]

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ....schemas import NextMotions, ProposedMotion, RevealedEffect
 from ...physics.contact_law import ContactLaw
 from ...physics.world import World
-from ...segments.candidates import Candidate, Variant, admissible, variants_of, without_effect
+from ...segments.candidates import Candidate, Variant, admissible, variants_of, without_effects
 from ...segments.contact_phases import is_round
 from ...segments.prepare import Prepared
 from ..thresholds import THRESHOLDS
@@ -241,11 +241,7 @@ def _leading(findings: Findings) -> str:
 
 def _world_without_contact_effects(findings: Findings) -> World:
     """Return the world with the effects of flight that were selected, and without those of contact."""
-    world = findings.world
-    for one in findings.chosen:
-        if one.where == "contact":
-            world = without_effect(world, one.evidence.name)
-    return world
+    return without_effects(findings.world, *(one.evidence.name for one in findings.chosen if one.where == "contact"))
 
 
 def _can_be_made(world: World, prepared: Prepared) -> bool:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ....schemas import NextExperiment
 from ...physics.world import World
 from ...report.page import listed
-from ...segments.candidates import Variant, variants_of, without_effect
+from ...segments.candidates import Variant, variants_of, without_effects
 from ...segments.prepare import Prepared
 from ..evidence.evidence import Evidence
 from ..thresholds import THRESHOLDS
@@ -105,12 +105,12 @@ def rivals_of(findings: Findings) -> Rivals | None:
         return None
     for one in shared:
         if len(one.equals) > 1:
-            return Rivals(one.equals, without_effect(findings.world, one.evidence.name))
+            return Rivals(one.equals, without_effects(findings.world, one.evidence.name))
     first = shared[0]
     second = _second_in_contact(findings) if first.where == "contact" else _second_in_flight(findings)
     if second is None:
         return None
-    return Rivals((first.evidence, second), without_effect(findings.world, first.evidence.name))
+    return Rivals((first.evidence, second), without_effects(findings.world, first.evidence.name))
 
 
 def next_experiment(prepared: Prepared, findings: Findings, throws: Sequence[Experiment]) -> NextExperiment | None:

@@ -15,7 +15,7 @@ from ....schemas import DiagnoseResult, NextExperiment, NotConvergedError
 from ...physics.engine import rollout
 from ...physics.impulse_solver import tangent_axes
 from ...physics.world import State, World
-from ...segments.candidates import without_effect
+from ...segments.candidates import without_effects
 from ...segments.flights.residual_wrench import ResidualWrenches, covariates_of, motion_axes, wrench_windows
 from ...segments.prepare import Prepared, whole_flights
 from ...segments.segments import Segments
@@ -186,7 +186,7 @@ def effect_picture(prepared: Prepared, world: World, name: str) -> EffectPicture
         words = "the fastest measured flight, and last as long"
     else:
         return None
-    found, bare = (_path(one, start, length_s) for one in (world, without_effect(world, name)))
+    found, bare = (_path(one, start, length_s) for one in (world, without_effects(world, name)))
     if found is None or bare is None:
         return None
     sides = [_from_side(world, start, place) for place in (found, bare)]

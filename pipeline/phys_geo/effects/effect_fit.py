@@ -12,6 +12,7 @@ from ....datasets.capture.tracks import Episode
 from ...physics.effects import ActiveEffect
 from ...physics.parameters import GROUND_SHIFT, Parameter, effect_parameters
 from ...physics.world import World
+from ...segments.candidates import without_effects
 from ...segments.first_contact_fit import AFTER_S, CONTACT_S, EffectEstimate, fit_first_contacts
 from ...segments.prepare import Prepared, prepare
 from ...segments.random_effects import fit_random_effects
@@ -93,7 +94,7 @@ class _Progress:
 
     def with_contacts(self, episodes: Episodes, contact: Sequence[str], noise: Noise) -> _Progress:
         """Add the effects that sliding segments identify, then those that impacts identify."""
-        prepared = prepare(_without(self.world, contact), episodes, noise)
+        prepared = prepare(without_effects(self.world, *contact), episodes, noise)
         progress = self
         for where, kind in (("in_glides", SlidingStart), ("in_impacts", ImpactStart)):
             progress = progress._with_contact_motion(where, kind, prepared)
@@ -104,7 +105,7 @@ class _Progress:
         missing = [a.effect for a in self.world.effects if a.effect.name in self.missing]
         # a force that no flight identified would be taken for the effects of contact: all are fitted together then
         names = [] if any(e.phase == "flight" for e in missing) else [e.name for e in missing if kind.may_identify(e)]
-        motion = kind.of(prepared, _without(self.world, names)) if names else None
+        motion = kind.of(prepared, without_effects(self.world, *names)) if names else None
         if motion is None:
             return self
         found = _best_of(self.world, names, lambda at, _: motion.fit(at, names))
@@ -127,11 +128,6 @@ class _Progress:
             lambda at, wanted: fit_first_contacts(at, episodes, wanted, self.along, noise, True, after_s),
         )
         return replace(self, missing=[], parts=self.parts | {"about_contacts": found})
-
-
-def _without(world: World, names: Sequence[str]) -> World:
-    """Return the world without the named effects."""
-    return replace(world, effects=tuple(a for a in world.effects if a.effect.name not in names))
 
 
 def _joined(parts: Mapping[str, EffectEstimate]) -> EffectEstimate:

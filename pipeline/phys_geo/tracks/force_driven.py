@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....datasets.capture.tracks import Track
+from ....datasets.shapes.interpolation import by_column
 from ...physics.chains.chain import Chain
 from ...physics.chains.dynamics import Balance, ChainDynamics, ChainMotion
 from ...physics.chains.values import with_chain_values
@@ -235,8 +236,7 @@ def _after(dynamics: ChainDynamics, balance: Balance, speed: Tensor, force: Tens
 
 def between(time_s: NDArray[np.float64], values: NDArray[np.float64], at_s: Tensor) -> Tensor:
     """Return values (S, 3) at times (S,) linearly between them at other times (N,), 0 outside."""
-    columns = [np.interp(at_s.numpy(), time_s, column, left=0.0, right=0.0) for column in values.T]
-    return torch.as_tensor(np.stack(columns, 1))
+    return torch.as_tensor(by_column(at_s.numpy(), time_s, values, outside=0.0))
 
 
 def impulse_errors(track: Track, std_n: float, edges_s: NDArray[np.float64]) -> NDArray[np.float64]:

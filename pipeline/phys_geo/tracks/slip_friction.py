@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....datasets.capture.tracks import Track
+from ....datasets.shapes.interpolation import by_column
 from ...geometry.rotation import quat_to_matrix, quat_turn
 from ...physics.contact_detection import Placed, all_body_points
 from ...physics.parameters import FRICTION
@@ -85,7 +86,7 @@ def _sliding(tracks: JointTracks, name: str, link: int, episode: int, track: Tra
     assert track.force_n is not None
     if len(times) < LEAST or len(track) < LEAST:
         return None
-    force = _at(track.time_s, track.force_n, times)
+    force = by_column(times, track.time_s, track.force_n)
     place, moved, errors = _path(track, times)
     turn = _turns(track, times)
     point, normal = _contact(tracks, name, link, episode, shown, place, turn)
@@ -105,14 +106,10 @@ def _sliding(tracks: JointTracks, name: str, link: int, episode: int, track: Tra
     return Sliding(along=(force[sure] * ahead).sum(1), normal=pressed[sure], std_n=std_n, bent=bent)
 
 
-def _at(time_s: NDArray[np.float64], values: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.stack([np.interp(times, time_s, column) for column in values.T], 1)
-
-
 def _path(track: Track, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     """Return places (K, 3), speeds (K, 3) and the errors of a component of these (K,) of a driven body at times."""
     noise = estimate_noise([track]).position_m
-    place = _at(track.time_s, track.position_m, times)
+    place = by_column(times, track.time_s, track.position_m)
     speeds, std = parabola_speeds(times, place, np.full_like(place, noise))
     return place, speeds, std[:, 0]
 

@@ -26,7 +26,7 @@ from cgwm.pipeline.physics import World
 from cgwm.pipeline.physics.contact_law import Touch
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.friction_ellipse import Ellipse
-from cgwm.pipeline.segments.candidates import base_parameters, without_effect
+from cgwm.pipeline.segments.candidates import base_parameters, without_effects
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.segments.segment_fit import refit
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -112,7 +112,7 @@ def test_a_wind_goes_with_the_drag_through_which_it_acts(monkeypatch: pytest.Mon
     values = {"linear_drag": {"c": 0.3}, "wind": {"w_x": 1.0, "w_y": 0.0}, "gravity_tilt": {"tilt_x": 0.01}}
     steps = [SelectionStep((), (evidence(name),), True) for name in values]
     monkeypatch.setattr(
-        flight_selection, "_without", lambda flight, world, names: (without_effect(world, *names), flight)
+        flight_selection, "_without", lambda flight, world, names: (without_effects(world, *names), flight)
     )
     found = FlightSelection(steps, world_with("ball", values), SimpleNamespace())  # type: ignore[arg-type]
     left = found.without({"linear_drag"})

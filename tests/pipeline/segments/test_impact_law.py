@@ -15,7 +15,7 @@ from cgwm.pipeline.geometry.rotation import quat_exp, quat_rotate
 from cgwm.pipeline.physics.contact_law import restitution
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.segments import contact_phases as phases_module
-from cgwm.pipeline.segments.candidates import Candidate, admissible, base_parameters, variants_of, without_effect
+from cgwm.pipeline.segments.candidates import Candidate, admissible, base_parameters, variants_of, without_effects
 from cgwm.pipeline.segments.center_of_mass import _center_of_mass, _one_body
 from cgwm.pipeline.segments.contact_phases import phases_of
 from cgwm.pipeline.segments.flights.slow_errors import COMMON_S, LIMITS, _timed_forces
@@ -226,8 +226,8 @@ def test_candidates_need_what_was_measured_and_what_the_model_lacks() -> None:
     kept, refused = admissible(dragged, some, turned=True)
     assert refused == {"linear_drag": "the model has it"}
     windy = world_with("ball", {"linear_drag": {"c": 0.2}, "wind": {}, "com_offset": {}})
-    assert [one.effect.name for one in without_effect(windy, "com_offset").effects] == ["linear_drag", "wind"]
-    assert [one.effect.name for one in without_effect(windy, "linear_drag").effects] == ["com_offset"]
+    assert [one.effect.name for one in without_effects(windy, "com_offset").effects] == ["linear_drag", "wind"]
+    assert [one.effect.name for one in without_effects(windy, "linear_drag").effects] == ["com_offset"]
     rolling = world_with("ball", {"linear_drag": {"c": 0.2}, "rolling_resistance": {"c_r": 0.01}})
     assert {p.name for p in base_parameters(rolling, "flight")} == {"linear_drag.c"}
     names = {p.name for p in base_parameters(rolling, "contact")}
