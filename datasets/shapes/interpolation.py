@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 
 def by_column(
-    at: ArrayLike, knots: NDArray[np.float64], values: NDArray[np.floating], outside: float | None = None
+    at: NDArray[np.floating] | float,
+    knots: NDArray[np.float64],
+    values: NDArray[np.floating],
+    outside: float | None = None,
 ) -> NDArray[np.float64]:
     """Return what values (K, C) at increasing knots (K,) are between them, each column linearly.
 
