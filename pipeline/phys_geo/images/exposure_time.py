@@ -21,6 +21,7 @@ from ....schemas import Exposure
 from ...rendering.label_renderer import LabelRenderer
 from ...rendering.motion_blur import exposed_for, poses_at
 from ...rendering.video_view import expose, renderable, usable_cameras, video_view
+from ...runtime.device import resolve_device
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -63,7 +64,11 @@ class _Frame:
 
 
 def with_durations(
-    model: Model, capture: Capture, split: str = "train", found: Mapping[str, dict[str, Track]] | None = None
+    model: Model,
+    capture: Capture,
+    split: str = "train",
+    found: Mapping[str, dict[str, Track]] | None = None,
+    device: str = "auto",
 ) -> Model:
     """Add to a model how long its video cameras expose a frame.
 
@@ -72,6 +77,7 @@ def with_durations(
         capture: Capture with calibrated cameras, videos and measured tracks.
         split: Name of the episodes.
         found: Tracks found in the videos, by episode and body, instead of measured ones; None for measured ones.
+        device: Device of the renderer: auto, cpu or cuda.
     """
     exposures = dict(model.file.exposures)
     if not renderable(model) or any(body.motion == "link" for body in model.file.bodies):
@@ -80,7 +86,8 @@ def with_durations(
     for name, exposure in exposures.items():
         frames = _fastest(model, capture, split, name, interval_s, found)
         if len(frames) >= FEWEST:
-            errors = np.array([_errors(model, frame, exposure, interval_s) for frame in frames])
+            drawn = _Drawn(model, str(resolve_device(device)))
+            errors = np.array([_errors(drawn.of(frame.camera), frame, exposure, interval_s) for frame in frames])
             exposures[name] = exposure.model_copy(update={"duration_s": interval_s * best_duration(errors)})
     return replace(model, file=model.file.model_copy(update={"exposures": exposures}))
 
@@ -160,9 +167,25 @@ def _poses(track: Track, times_s: Array) -> tuple[Array, Array]:
     return poses_at(track.time_s, track.position_m[:, None], track.quat_wxyz[:, None], times_s)
 
 
-def _errors(model: Model, frame: _Frame, exposure: Exposure, interval_s: float) -> Array:
+@dataclass
+class _Drawn:
+    """A model in one camera after the other; a camera that stands is prepared once."""
+
+    model: Model
+    device: str
+    _camera: Camera | None = None
+    _renderer: LabelRenderer | None = None
+
+    def of(self, camera: Camera) -> LabelRenderer:
+        """Return the renderer of a camera."""
+        known = self._camera
+        if self._renderer is None or known is None or not np.array_equal(known.T_world_cam, camera.T_world_cam):
+            self._camera, self._renderer = camera, LabelRenderer(self.model, {"": camera}, self.device)
+        return self._renderer
+
+
+def _errors(renderer: LabelRenderer, frame: _Frame, exposure: Exposure, interval_s: float) -> Array:
     """Return the mean square errors (duration,) of pictures of a frame over exposures of the `DURATIONS`."""
-    renderer = LabelRenderer(model, {"": frame.camera}, "cpu")
     touched = ~frame.valid
 
     def draw(_: NDArray[np.intp], position_m: Array, quat_wxyz: Array) -> Image:
