@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -38,11 +39,20 @@ def rollout(
     times_s: Tensor,
     driven: Mapping[str, Track | Drive | JointCommand] | None = None,
     record_contacts: bool = False,
+    bodies: tuple[int, ...] | None = None,
 ) -> Rollout:
     """Simulate a world, in the fused kernel where that supports it: on CUDA, or on a CPU with a C++ compiler.
 
     Otherwise the torch engine runs, and the log gives each reason once, except on a CPU without a compiler. A world
     whose `rolls_on` is another device is copied there if the kernel supports it, and the rollout is copied back.
+
+    Args:
+        world: The world; see :func:`simulate` for the other arguments.
+        state: The state at the first time.
+        times_s: Frame times [s].
+        driven: The commands.
+        record_contacts: Whether to keep the contacts of every frame.
+        bodies: Bodies of which the motion is wanted, in this order; None for all. Only they are copied back.
 
     Raises:
         InputDataError, UsageError: See :func:`simulate`.
@@ -51,15 +61,23 @@ def rollout(
     if world.rolls_on not in (None, home.type) and home.type == "cpu":
         reason = unsupported(world) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
         if reason is None:
-            return simulate_fused(world, state, times_s, driven, record_contacts)
+            return simulate_fused(world, state, times_s, driven, record_contacts, bodies=bodies)
         _note(reason)
     run, against = (simulate_fused, unsupported) if home.type == "cuda" else (simulate_on_host, lacking)
     reason = against(world) or lacking_derivatives(world, state, times_s, driven or {}, record_contacts)
     if reason is None:
-        return run(world, state, times_s, driven, record_contacts)
+        return _of_bodies(run(world, state, times_s, driven, record_contacts), bodies)
     if home.type == "cuda" or compiler() is not None:
         _note(reason)
-    return simulate(world, state, times_s, driven, record_contacts)
+    return _of_bodies(simulate(world, state, times_s, driven, record_contacts), bodies)
+
+
+def _of_bodies(motion: Rollout, bodies: tuple[int, ...] | None) -> Rollout:
+    """Return the motion of some bodies; None for all."""
+    if bodies is None:
+        return motion
+    rows = torch.tensor(bodies, dtype=torch.long, device=motion.position_m.device)
+    return replace(motion, **{name: getattr(motion, name).index_select(2, rows) for name in _MOTION})
 
 
 def rollouts_at_once(world: World) -> int:

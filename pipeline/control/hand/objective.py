@@ -75,9 +75,7 @@ class HandObjective:
         """See :class:`Objective`."""
         costs, tips = self.hand.task.costs, self.hand.tips
         motion, targets = self._predicted(values, draws)
-        # of many bodies in a motion few count: gathered once, they lie together
-        counted = torch.tensor((self.hand.object, *tips.links))
-        position, quat = (part[:, 1:].index_select(2, counted) for part in (motion.position_m, motion.quat_wxyz))
+        position, quat = motion.position_m[:, 1:], motion.quat_wxyz[:, 1:]
         place = position[:, :, 0] - torch.tensor(self.hand.task.wanted_m, dtype=torch.float64)
         turn = quat_turn(torch.as_tensor(self.goal_wxyz), quat[:, :, 0])
         lost = ((place.square().sum(-1, keepdim=True) + 1e-24).sqrt() - costs.keep_m).clamp_min(0.0)
@@ -129,17 +127,18 @@ class HandObjective:
         motion, _ = self._predicted(values[None], torch.zeros(1, dtype=torch.long))
         return Forecast(
             times_s=self._frames.numpy() + self.times_s[0],
-            position_m=motion.position_m[0, :, self.hand.object].numpy(),
-            quat_wxyz=motion.quat_wxyz[0, :, self.hand.object].numpy(),
+            position_m=motion.position_m[0, :, 0].numpy(),
+            quat_wxyz=motion.quat_wxyz[0, :, 0].numpy(),
         )
 
     def _predicted(self, values: Tensor, draws: Tensor) -> tuple[Rollout, Tensor]:
-        """Return the predicted motion of sequences (b, N, joints) under draws (b,), and the targets."""
+        """Return the predicted motion of object and tips, of sequences (b, N, joints) under draws (b,), and targets."""
         targets = self.within_limits(values)
         times = torch.as_tensor(self.times_s - self.times_s[0])
         world = self.worlds.batch(tuple(draws.tolist()) if self.draws > 1 else ())
         command = JointCommand.targets(times[None], targets)
-        return rollout(world, self.state, self._frames, {self.hand.chain.name: command}), targets
+        counted = (self.hand.object, *self.hand.tips.links)
+        return rollout(world, self.state, self._frames, {self.hand.chain.name: command}, bodies=counted), targets
 
     @property
     def _frames(self) -> Tensor:

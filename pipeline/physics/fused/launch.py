@@ -18,6 +18,8 @@ from .structure import Structure
 
 WRITTEN = (16, 17, 18)
 """Indices of the pointers to results: frames, their tangents and labels."""
+LABELS = 18
+"""Index of the pointer to labels."""
 LASTING = (4, 6, 11, 14, 15)
 """Those of what depends on a world alone: geometry, surfaces, spheres of contacts, and meshes."""
 ALIGNMENT = 256
@@ -78,29 +80,44 @@ def launch(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tu
     kernel_build.launch(kernel, device, blocks, structure.threads, tensors, *words, shared_bytes=size)
 
 
-def launch_away(structure: Structure, tensors: tuple[Tensor | None, ...], numbers: tuple[int, ...]) -> None:
+def launch_away(
+    structure: Structure,
+    tensors: tuple[Tensor | None, ...],
+    numbers: tuple[int, ...],
+    bodies: tuple[int, ...] | None = None,
+) -> None:
     """Launch a kernel on the current CUDA device for tensors on the CPU, which are copied there and results back.
 
     Packing a world takes a hundred operations on small tensors, which are faster on the CPU than as CUDA launches. What
-    depends on the world alone stays on the device; all else goes there in one piece.
+    depends on the world alone stays on the device; all else goes there in one piece. Of the frames come back those of
+    the first body and of some others; None for all.
     """
-    away = [
-        None
-        if tensor is None
-        else torch.empty_like(tensor, device="cuda", pin_memory=False)
-        if k in WRITTEN
-        else tensor
-        for k, tensor in enumerate(tensors)
-    ]
+    away = [_room_for(k, tensor, structure) if k in WRITTEN else tensor for k, tensor in enumerate(tensors)]
     for k in LASTING:
         away[k] = _kept_there(away[k])
     _send([k for k, tensor in enumerate(away) if tensor is not None and not tensor.is_cuda], away)
     launch(structure, tuple(away), numbers)
+    rows = None if bodies is None else _rows_there((0, *bodies), torch.cuda.current_device())
     for k in WRITTEN:
         local, remote = tensors[k], away[k]
         if local is not None and remote is not None:
-            local.copy_(remote, non_blocking=local.is_pinned())
+            chosen = remote if rows is None or k == LABELS else remote.index_select(2, rows)
+            local.copy_(chosen, non_blocking=local.is_pinned())
     torch.cuda.current_stream().synchronize()
+
+
+def _room_for(index: int, tensor: Tensor | None, structure: Structure) -> Tensor | None:
+    """Return memory on the current CUDA device for a result: of frames, for all bodies."""
+    if tensor is None:
+        return None
+    shape = tensor.shape if index == LABELS else (*tensor.shape[:2], len(structure.free), tensor.shape[3])
+    return torch.empty(shape, dtype=tensor.dtype, device="cuda")
+
+
+@cache
+def _rows_there(rows: tuple[int, ...], device: int) -> Tensor:
+    """Return indices on a CUDA device."""
+    return torch.tensor(rows, device=f"cuda:{device}")
 
 
 def _kept_there(tensor: Tensor | None) -> Tensor | None:

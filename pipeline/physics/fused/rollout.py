@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -48,6 +49,7 @@ def simulate_fused(
     driven: Mapping[str, Track | Drive | JointCommand] | None = None,
     record_contacts: bool = False,
     lanes: int | None = None,
+    bodies: tuple[int, ...] | None = None,
 ) -> Rollout:
     """Simulate a world in one kernel, as `simulate` does, for tensors on one CUDA device or on the CPU.
 
@@ -65,6 +67,7 @@ def simulate_fused(
         record_contacts: Whether to keep the contacts of every frame.
         lanes: Threads per environment, a power of two up to 32 (up to 256 where hulls of links may touch); None for
             the default.
+        bodies: Bodies of which the motion is returned, in this order, where it is copied to the CPU; None for all.
 
     Returns:
         The rollout at the frame times.
@@ -77,9 +80,10 @@ def simulate_fused(
     if reason is not None:
         raise UsageError(f"the fused kernel cannot take this world: {reason}.", todo="use simulate, which can.")
     device = world.gravity.device
-    run = launch if device.type == "cuda" else launch_away
-    room = block_room(device.index if device.type == "cuda" else None)
-    return roll(run, world, state, times_s, driven, record_contacts, lanes, room)
+    given = world, state, times_s, driven, record_contacts, lanes
+    if device.type == "cuda":
+        return roll(launch, *given, block_room(device.index))
+    return roll(partial(launch_away, bodies=bodies), *given, block_room(None), bodies, pinned=True)
 
 
 def roll(
@@ -91,10 +95,14 @@ def roll(
     record_contacts: bool = False,
     lanes: int | None = None,
     room: int = SHARED_BYTES,
+    bodies: tuple[int, ...] | None = None,
+    pinned: bool = False,
 ) -> Rollout:
     """Check and pack the arguments of `simulate_fused`, run the kernel by `run`, and return the rollout.
 
-    `room` is the memory that a block of threads may have where it asks for it [bytes].
+    `room` is the memory that a block of threads may have where it asks for it [bytes]. Of `bodies`, where they are
+    given, `run` brings the frames, after those of the first body; `pinned` if a device copies them, which is then many
+    times faster.
 
     Raises:
         UsageError: If there were more contacts at once than a block of threads has room for.
@@ -114,15 +122,15 @@ def roll(
             "record_contacts=False.",
             todo="leave record_contacts out where derivatives are wanted, or roll out on the CPU without the kernel.",
         )
-    batch, count, bodies = packed.table.shape[0], times_s.shape[-1], len(world.bodies)
+    batch, count = packed.table.shape[0], times_s.shape[-1]
+    rows = len(world.bodies) if bodies is None else 1 + len(bodies)
     structure = packed.structure
     shape = (structure.contacts, batch, structure.single, dual, structure.paired)
     links = 0 if structure.tree is None else len(structure.tree.bodies)
     chosen = lanes or lanes_for(*shape, links=links, hulled=structure.hulled)
     structure = structure.launched(dual, chosen, room)
-    # a device copies into pinned memory many times faster
-    like: Any = {"dtype": values[0].dtype, "device": values[0].device, "pin_memory": run is launch_away}
-    frames = torch.empty(batch, count, bodies, FRAME_WIDTH, **like)
+    like: Any = {"dtype": values[0].dtype, "device": values[0].device, "pin_memory": pinned}
+    frames = torch.empty(batch, count, rows, FRAME_WIDTH, **like)
     frame_tangents = torch.empty_like(frames) if dual else None
     labels = values[0].new_empty(batch, count, structure.contacts, LABEL_WIDTH) if record_contacts else None
     strides = [0 if x.shape[0] == 1 else x[0].numel() for x in (*values[1:], packed.drive_last)]
@@ -134,7 +142,7 @@ def roll(
         require_all_contacts(structure, frames)
     if frame_tangents is not None:
         frames = dual_of(frames, frame_tangents)
-    return read_frames(world, times_s, packed, frames, labels)
+    return read_frames(world, times_s, packed, frames if bodies is None else frames[:, :, 1:], labels)
 
 
 def require_all_contacts(structure: Structure, frames: Tensor) -> None:

@@ -924,6 +924,9 @@ def test_rollouts_are_taken_to_the_gpu_and_brought_back() -> None:
     found = engine.rollout(away, state, times(0.2), driven, True)
     assert found.position_m.device.type == "cpu" and not torch.equal(found.position_m, expected.position_m)
     agree(expected, found, 1e-9)
+    some = engine.rollout(away, state, times(0.2), driven, bodies=(2, 0))
+    assert torch.equal(some.position_m, found.position_m[:, :, (2, 0)])
+    assert torch.equal(some.omega_body_rad_s, found.omega_body_rad_s[:, :, (2, 0)])
 
     def ends(z: Tensor, repeats: int, on: World) -> Tensor:
         changed = apply_parameters(on, CONTACT_PARAMETERS, z.exp())
