@@ -245,9 +245,17 @@ def _recorded(
 
 
 def _mixed(chosen: Sequence[RealCase]) -> list[RealCase]:
-    """Return cases in an order in which every kind comes early, so that a run that is cut off tells of all."""
-    order = np.random.default_rng(0).permutation(len(chosen))
-    return [chosen[k] for k in order]
+    """Return cases in a random order in which a run that is cut off at any time has as much of each row and engine."""
+    rng = np.random.default_rng(0)
+    kinds: dict[tuple[str, str], list[RealCase]] = {}
+    for case in chosen:
+        kinds.setdefault((case.row, case.engine), []).append(case)
+    placed = [
+        ((k + rng.uniform()) / len(own), own[at])
+        for own in kinds.values()
+        for k, at in enumerate(rng.permutation(len(own)))
+    ]
+    return [case for _, case in sorted(placed, key=lambda one: one[0])]
 
 
 if __name__ == "__main__":

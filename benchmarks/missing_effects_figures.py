@@ -6,13 +6,17 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from real_like.score import EQUIVALENT, RIGHT, judge, ratio_of, wilson
+from real_like.score import RIGHT, judge, ratio_of, wilson
 from render_results import record
 
 LARGE_RATIO = 300**0.5
 """From this multiple of the slow error on an effect counts as large: the middle of 3 to 100 on a log scale."""
 MOST_FALSE_NULLS, MOST_WRONG_UNKNOWN, LEAST_LARGE, LEAST_SMALL, LEAST_PAIRS = 0.02, 0.05, 0.9, 0.8, 0.8
 MOST_RATIO = 0.5
+OTHER_FORMULAS = {"ground_magnet", "adhesion", "stribeck_friction"}
+"""Effects that the captures hide by another formula than the library's, whose numbers mean another thing: a power of
+the height for an exponential, a ramp for a smooth one, the square of a speed for the speed. So does the drag of a box,
+which captures have along each of its sides: of the number along a side, a flow along the diagonal feels 0.58."""
 Row = dict[str, Any]
 
 
@@ -81,17 +85,17 @@ def _added(who: str, named: Sequence[Row]) -> Iterator[Row]:
 def comparable(row: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the hidden effects of a row whose numbers mean the same in the truth and in what was named.
 
-    Left out are laws with other constants (the reach of a magnet), and what a session's own scale of lengths changes:
-    the tracks then carry the effect and the mean of the scales.
+    Left out are laws of another formula, and laws with other constants. What sessions have of a scale of their own is
+    not: an interval of an effect that does the same has to allow for their mean.
     """
     constants = {one["effect"]: one["constants"] for one in row["found"]["ranking"]}
-    scaled = EQUIVALENT[0] if "scale" in row["truth"]["errors"]["carried"] else set()
+    boxes = set() if row["truth"]["thing"] == "ball" else {"quadratic_drag"}
 
     def same(effect: dict[str, Any]) -> bool:
         given = constants.get(effect["name"], {})
         return all(abs(effect["values"].get(name, value) - value) < 1e-3 * abs(value) for name, value in given.items())
 
-    return [effect for effect in row["truth"]["effects"] if effect["name"] not in scaled and same(effect)]
+    return [one for one in row["truth"]["effects"] if one["name"] not in OTHER_FORMULAS | boxes and same(one)]
 
 
 def _right(judged: Sequence[tuple[Row, Row]], row: str) -> list[bool]:
