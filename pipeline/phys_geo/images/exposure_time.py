@@ -197,7 +197,7 @@ def _errors(renderer: LabelRenderer, frame: _Frame, exposure: Exposure, interval
     shown = draw(np.zeros(1, np.intp), *frame.poses(now))
     pictures = [exposed_for(part * interval_s, draw, shown, frame.poses, now)[0] for part in DURATIONS]
     near = cv2.dilate(touched.astype(np.uint8), np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)) > 0
-    real = frame.image.astype(np.float32) / 255
+    real = frame.image.astype(np.float32) / np.float32(255)
     return np.array([unexplained(expose(picture, exposure), real, near & frame.valid) for picture in pictures])
 
 
