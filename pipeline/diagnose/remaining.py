@@ -133,7 +133,7 @@ def slides_of(sliding: StartedSliding | None) -> list[PhaseMisfit]:
         return []
     chosen = found.segments.select(moved)
     parameters = nuisance_parameters(chosen.world, sliding.flight_parameters)
-    rows = chosen.residuals(parameters, found.values[0], jacobian=False)[0]
+    rows = torch.nan_to_num(chosen.residuals(parameters, found.values[0], jacobian=False)[0])
     dof = chosen.dof.clamp_min(1.0)
     one = _misfit("sliding", chosen, found.chi2[moved] / dof, rows)
     own = sliding.separate.chi2[moved] / dof

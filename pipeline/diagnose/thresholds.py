@@ -108,7 +108,7 @@ class FlightThresholds:
         "episode",
         "development: true ones at least 0.83, false ones at most 0.42",
         "report8: 1 of 44 named with an effect too many; 305 captures of real-like development: of ten seconds that "
-        "explain less, the four that repeat are true, and the scale that sessions carry",
+        "explain less, six repeat, three hidden ones and three times the scale that sessions carry",
     )
     paired_t: float = threshold(
         3.0,
