@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -87,14 +87,19 @@ def read_colmap_model(folder: Path, metric: bool = False) -> CamerasFile:
             cameras[f"camera{number}"] = _intrinsics(f"{place}", number, model, width, height, params)
     with _faults(image_path) as place:
         for name, camera, quat_wxyz, translation in (_images_bin if binary else _images_txt)(place):
-            if not all(map(math.isfinite, (*quat_wxyz, *translation))) or not any(quat_wxyz):
-                raise ValueError(f"image '{name}' has a pose that is not finite, or no rotation")
             if f"camera{camera}" not in cameras:
                 raise ValueError(f"image '{name}' is of the camera {camera}, which {camera_path.name} does not have")
-            pose = _world_from_camera(np.array(quat_wxyz), np.array(translation))
+            pose = _pose(name, quat_wxyz, translation)
             images[name.removeprefix("images/")] = PosedImage(camera=f"camera{camera}", T_world_cam=pose)
     scale = Scale(kind="metric" if metric else "unscaled", source="COLMAP model")
     return CamerasFile(scale=scale, cameras=cameras, images=images)
+
+
+def _pose(name: str, quat_wxyz: Sequence[float], translation: Sequence[float]) -> Matrix4:
+    """Return the pose camera to world of an image."""
+    if not all(map(math.isfinite, (*quat_wxyz, *translation))) or not any(quat_wxyz):
+        raise ValueError(f"image '{name}' has a pose that is not finite, or no rotation")
+    return _world_from_camera(np.array(quat_wxyz), np.array(translation))
 
 
 class _Place:

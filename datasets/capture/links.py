@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -31,6 +32,16 @@ def articulations_of(root: Path, manifest: CaptureManifest) -> dict[str, Articul
 
 
 def _read(root: Path, entry: Entry) -> Articulation:
+    path = _file(root, entry)
+    found = read_articulation(require_regular_file(path), bare_links=True).welded()
+    _require_passive(path, [joint for joint in found.joints if joint.kind != "fixed"])
+    for link in found.links:
+        _require_link(path, link, moves=entry.base == "free" or link is not found.links[0])
+    return found
+
+
+def _file(root: Path, entry: Entry) -> Path:
+    """Return the file of a jointed body, which must lie inside the capture."""
     path = root / entry.path
     where = f"{root / 'capture.toml'}: [[articulations]] '{entry.name}': '{entry.path}'"
     if not real_path(path).is_relative_to(real_path(root)):
@@ -43,8 +54,11 @@ def _read(root: Path, entry: Entry) -> Articulation:
             "a path relative to the capture directory.",
             "add the file, or correct its name in capture.toml.",
         )
-    found = read_articulation(require_regular_file(path), bare_links=True).welded()
-    moving = [joint for joint in found.joints if joint.kind != "fixed"]
+    return path
+
+
+def _require_passive(path: Path, moving: Sequence[JointOfRobot]) -> None:
+    """Refuse a joint with a servo, and a body in which no joint moves."""
     served = next((joint.name for joint in moving if joint.stiffness > 0), None)
     if served is not None:
         raise InputDataError(
@@ -54,9 +68,6 @@ def _read(root: Path, entry: Entry) -> Articulation:
         )
     if not moving:
         raise InputDataError(f"{path}: none of its joints moves.", todo="make it one of [[bodies]] with a shape.")
-    for link in found.links:
-        _require_link(path, link, moves=entry.base == "free" or link is not found.links[0])
-    return found
 
 
 def _require_link(path: Path, link: LinkOfRobot, moves: bool) -> None:

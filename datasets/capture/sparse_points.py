@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,17 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
     Raises:
         InputDataError: If it is another kind of file, truncated, or contains a point that is not finite.
     """
-    data = read_binary_file(path, MOST_BYTES)
+    table = _table(path, read_binary_file(path, MOST_BYTES))
+    bad = int(np.count_nonzero(~np.isfinite(table["xyz"]).all(1)))
+    if bad:
+        raise InputDataError(
+            f"{path}: {bad} of {len(table)} points are not finite.", todo="run 'cgwm calibrate --overwrite'."
+        )
+    return table["xyz"].astype(np.float64), table["rgb"].astype(np.uint8)
+
+
+def _table(path: Path, data: bytes) -> NDArray[Any]:
+    """Return the points of a file, as they are stored."""
     header, found, body = data.partition(b"end_header\n")
     lines = header.decode("ascii", "replace").splitlines()
     counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
@@ -66,10 +77,4 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
             f"{path}: truncated: {counts[0]} points announced, {len(body) // _VERTEX.itemsize} found.",
             todo="run 'cgwm calibrate --overwrite'.",
         )
-    table = np.frombuffer(body, _VERTEX)
-    bad = int(np.count_nonzero(~np.isfinite(table["xyz"]).all(1)))
-    if bad:
-        raise InputDataError(
-            f"{path}: {bad} of {len(table)} points are not finite.", todo="run 'cgwm calibrate --overwrite'."
-        )
-    return table["xyz"].astype(np.float64), table["rgb"].astype(np.uint8)
+    return np.frombuffer(body, _VERTEX)

@@ -117,16 +117,21 @@ def _motion(
     track, outline = tracks[body.name], outlines[body.name]
     if outline is not None and track.quat_wxyz is None and outline.points.any():
         outline = None
-    others = []
-    for other in capture.manifest.bodies:
-        if other.name == body.name:
-            continue
-        shape = outlines[other.name]
-        place = _positions(other, tracks.get(other.name), track.time_s)
-        others.append((place, np.inf if shape is None or place is None else shape.size_m))
-    known = tuple((np.zeros((len(track), 3)) if place is None else place, size) for place, size in others)
+    others = tuple(
+        _neighbour(other, tracks.get(other.name), outlines[other.name], track.time_s)
+        for other in capture.manifest.bodies
+        if other.name != body.name
+    )
     windows = motion_windows(track)
-    return TrackedMotion(episode=episode, body=body, track=track, windows=windows, outline=outline, others=known)
+    return TrackedMotion(episode=episode, body=body, track=track, windows=windows, outline=outline, others=others)
+
+
+def _neighbour(body: Body, track: Track | None, outline: Outline | None, time_s: Array) -> tuple[Array, float]:
+    """Return the positions of another body at times (T,), and its size [m]: infinite where either is not known."""
+    place = _positions(body, track, time_s)
+    if place is None:
+        return np.zeros((len(time_s), 3)), np.inf
+    return place, np.inf if outline is None else outline.size_m
 
 
 def _positions(body: Body, track: Track | None, time_s: Array) -> Array | None:

@@ -45,7 +45,19 @@ def frame_files(folder: Path) -> list[Path]:
     Raises:
         InputDataError: If a name is not a number, or a number is missing, which would shift the times of later frames.
     """
-    files = [path for path in entries_of(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
+    numbered = _numbered([path for path in entries_of(folder) if path.suffix.lower() in IMAGE_SUFFIXES])
+    missing = next((k for k in range(len(numbered)) if k not in numbered), None)
+    if missing is not None:
+        raise InputDataError(
+            f"{folder}: frame {missing} is missing ({len(numbered)} frames, the last is {max(numbered)}).",
+            "frames numbered 0, 1, 2, ... without gaps, since the number is the time.",
+            "number the frames from 0.",
+        )
+    return [numbered[k] for k in range(len(numbered))]
+
+
+def _numbered(files: Sequence[Path]) -> dict[int, Path]:
+    """Return files by the numbers that are their names."""
     numbered: dict[int, Path] = {}
     for file in files:
         if not (file.stem.isascii() and file.stem.isdecimal()):
@@ -61,14 +73,7 @@ def frame_files(folder: Path) -> list[Path]:
                 todo="remove one of the two.",
             )
         numbered[number] = file
-    missing = next((k for k in range(len(numbered)) if k not in numbered), None)
-    if missing is not None:
-        raise InputDataError(
-            f"{folder}: frame {missing} is missing ({len(numbered)} frames, the last is {max(numbered)}).",
-            "frames numbered 0, 1, 2, ... without gaps, since the number is the time.",
-            "number the frames from 0.",
-        )
-    return [numbered[k] for k in range(len(numbered))]
+    return numbered
 
 
 def video_info(path: Path, decode: bool = False) -> VideoInfo:

@@ -198,14 +198,7 @@ def _read_json(path: Path) -> list[tuple[Array, Array]]:
     try:
         data: Any = parse_json(read_text_file(path), path)
         rate = float(data["Timebase"]["Frequency"])
-        throws = []
-        for marker in data["Markers"]:
-            times, positions = [], []
-            for part in marker["Parts"]:
-                values = np.array([row[:3] for row in part["Values"]], np.float64).reshape(-1, 3)
-                times.append((part["Range"]["Start"] + np.arange(len(values))) / rate)
-                positions.append(1e-3 * values)
-            throws.append((np.concatenate(times), np.concatenate(positions)))
+        throws = [_motion_of_marker(marker["Parts"], rate) for marker in data["Markers"]]
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else "its entries have another form"
         raise InputDataError(
@@ -216,3 +209,13 @@ def _read_json(path: Path) -> list[tuple[Array, Array]]:
     if not throws:
         raise InputDataError(f"{path}: no markers.", todo=_TODO)
     return throws
+
+
+def _motion_of_marker(parts: Any, rate_hz: float) -> tuple[Array, Array]:
+    """Return times [s] and positions [m] of a marker, in whose parts positions are in millimetres."""
+    times, positions = [], []
+    for part in parts:
+        values = np.array([row[:3] for row in part["Values"]], np.float64).reshape(-1, 3)
+        times.append((part["Range"]["Start"] + np.arange(len(values))) / rate_hz)
+        positions.append(1e-3 * values)
+    return np.concatenate(times), np.concatenate(positions)

@@ -83,12 +83,7 @@ def _write_depth(
     stream = recording.stream("Depth")
     if stream is None:
         return ["no depth stream: the scale has to come from elsewhere (docs: Calibrate)"]
-    at, there = recording.times(color)[chosen], recording.times(stream)
-    nearest = np.abs(there[None] - at[:, None]).argmin(axis=1) if len(there) else np.zeros(0, int)
-    pairs: dict[int, list[int]] = {}
-    for photo, time, k in zip(chosen, at, nearest, strict=False):
-        if abs(int(there[k]) - int(time)) <= DEPTH_WITHIN_NS:
-            pairs.setdefault(int(k), []).append(photo)
+    pairs = _photos_by_map(recording.times(color)[chosen], recording.times(stream), chosen)
     unit, depth_geometry = recording.depth_unit_m(stream), recording.geometry(stream)
     if pairs:
         (directory / "depth").mkdir()
@@ -100,6 +95,16 @@ def _write_depth(
             write_depth(directory / "depth" / f"{photo:06d}.png", millimetres)
     without = len(chosen) - sum(map(len, pairs.values()))
     return [f"{without} of {len(chosen)} photos have no depth at their time"] if without else []
+
+
+def _photos_by_map(at: NDArray[np.int64], there: NDArray[np.int64], photos: list[int]) -> dict[int, list[int]]:
+    """Return the photos, taken at times `at`, whose nearest depth map is close enough, by the number of the map."""
+    nearest = np.abs(there[None] - at[:, None]).argmin(axis=1) if len(there) else np.zeros(0, int)
+    pairs: dict[int, list[int]] = {}
+    for photo, time, k in zip(photos, at, nearest, strict=False):
+        if abs(int(there[k]) - int(time)) <= DEPTH_WITHIN_NS:
+            pairs.setdefault(int(k), []).append(photo)
+    return pairs
 
 
 def in_color_pixels(depth_m: Array, depth: StreamGeometry, color: StreamGeometry) -> Array:

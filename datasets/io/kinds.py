@@ -58,10 +58,15 @@ def refuse_other_kind(path: Path, wanted: Kind) -> None:
             f"a {wanted}, a directory with {_MARKS[wanted]}.",
             f"{_USED_BY[found]}; pass a {wanted} here.",
         )
-    todo = "check the path."
-    if wanted == "capture" and any((path / folder).is_dir() for folder in ("images", "videos", "tracks")):
-        manifest = typed_path(path / "capture.toml")
-        todo = f"write a manifest; the shortest one: echo 'format = \"{CAPTURE_FORMAT}\"' > {manifest}"
-    elif wanted == "capture" and any(one.suffix.lower() in PHOTO_SUFFIXES for one in path.iterdir()):
-        todo = f"make a capture of its photos: cgwm import photos {typed_path(path)} --out CAPTURE"
+    todo = _way_to_capture(path) if wanted == "capture" else "check the path."
     raise InputDataError(f"{path} is no {wanted}: it has no {_MARKS[wanted]}.", todo=todo)
+
+
+def _way_to_capture(path: Path) -> str:
+    """Return how a folder of data becomes a capture."""
+    if any((path / folder).is_dir() for folder in ("images", "videos", "tracks")):
+        manifest = typed_path(path / "capture.toml")
+        return f"write a manifest; the shortest one: echo 'format = \"{CAPTURE_FORMAT}\"' > {manifest}"
+    if any(one.suffix.lower() in PHOTO_SUFFIXES for one in path.iterdir()):
+        return f"make a capture of its photos: cgwm import photos {typed_path(path)} --out CAPTURE"
+    return "check the path."

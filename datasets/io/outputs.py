@@ -251,15 +251,15 @@ def _directory_fault(path: Path, kind: str) -> str:
     record = _read_record(path)
     if record is None or record.get("kind") != kind:
         return f"holds no {kind}" + ("" if record is None else f" but {_with_article(str(record.get('kind')))}")
-    files = record["files"]
-    for name in names:
-        if _is_added(path, kind, name):
-            continue
-        if name not in files:
-            return f"holds {name}, which cgwm did not write"
-        if files[name] != _digest(path / name):
-            return f"holds {name}, which was changed since cgwm wrote it"
-    return ""
+    own = [name for name in names if not _is_added(path, kind, name)]
+    return next(filter(None, (_change(path, name, record["files"]) for name in own)), "")
+
+
+def _change(folder: Path, name: str, files: Mapping[str, str]) -> str:
+    """Return why a file is not as cgwm wrote it, by the digests of those that it wrote; "" if it is."""
+    if name not in files:
+        return f"holds {name}, which cgwm did not write"
+    return "" if files[name] == _digest(folder / name) else f"holds {name}, which was changed since cgwm wrote it"
 
 
 def _is_added(folder: Path, kind: str, name: str) -> bool:

@@ -25,10 +25,9 @@ def require_place(path: Path | str) -> None:
     strange = next((letter for letter in str(path) if ord(letter) < 32 or ord(letter) == 127), None)
     if strange is not None:
         raise UsageError(f"{str(path)!r}: a name with the control character {strange!r}.", todo=_ANOTHER)
-    for part, most in [*((part, _LONGEST_PART) for part in path.parent.parts), (path.name, LONGEST_NAME)]:
-        size = len(os.fsencode(part))
-        if size > most:
-            raise UsageError(f"{part[:40]}...: a name of {size} bytes.", f"at most {most} bytes.", _ANOTHER)
+    for part in path.parent.parts:
+        _require_short(part, _LONGEST_PART)
+    _require_short(path.name, LONGEST_NAME)
     folder = _nearest(path.parent)
     if not folder.is_dir():
         raise UsageError(f"{path}: {folder} is a file, and no folder.", "a name in a folder.", _ANOTHER)
@@ -37,6 +36,12 @@ def require_place(path: Path | str) -> None:
             f"{path}: the folder {folder} cannot be written to.", "a folder of your own, on a disk that is writable.",
             f"{_ANOTHER[:-1]}, or check the permissions of that folder.",
         )  # fmt: skip
+
+
+def _require_short(name: str, most: int) -> None:
+    size = len(os.fsencode(name))
+    if size > most:
+        raise UsageError(f"{name[:40]}...: a name of {size} bytes.", f"at most {most} bytes.", _ANOTHER)
 
 
 def _nearest(folder: Path) -> Path:

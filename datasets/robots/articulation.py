@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -145,13 +146,7 @@ class Articulation:
             below = [joint for joint in joints if joint.parent == link]
             placed += below
             order += [joint.link for joint in below]
-        if len(order) != len(links):
-            lost = next(link for link in links if link not in order)
-            raise InputDataError(
-                f"{path}: link '{lost}' hangs in a ring of joints.",
-                "one tree of links.",
-                "leave out the joint that closes the ring.",
-            )
+        _require_all(path, links, order)
         _require_own_names(path, [joint.name for joint in placed])
         for joint in placed:
             joint.require_possible(path)
@@ -277,4 +272,15 @@ def _require_own_names(path: Path, names: list[str]) -> None:
         twice = next(one for one in names if names.count(one) > 1)
         raise InputDataError(
             f"{path}: several joints are called '{twice}'.", "a name of its own for each joint.", "rename one of them."
+        )
+
+
+def _require_all(path: Path, links: Iterable[str], reached: Sequence[str]) -> None:
+    """Refuse links that cannot be reached from the root."""
+    lost = next((link for link in links if link not in reached), None)
+    if lost is not None:
+        raise InputDataError(
+            f"{path}: link '{lost}' hangs in a ring of joints.",
+            "one tree of links.",
+            "leave out the joint that closes the ring.",
         )

@@ -375,13 +375,15 @@ def table_rows() -> list[str]:
     """Return the table of docs/datasets.md, a line each."""
     rows = ["| where | shape, type | unit, frame | values | what |", "| --- | --- | --- | --- | --- |"]
     entries = [entry for name, entry in ARRAYS.items() for entry in ([entry, JPEG] if name == JPEG.name else [entry])]
-    for entry in entries:
-        place = entry.name.replace("{", "<").replace("}", ">")
-        unit = "varies" if "{" in entry.unit else entry.unit
-        frame = "image" if "{" in entry.frame else entry.frame
-        what = " ".join(text for text in (entry.text, entry.note) if text and not text.startswith("{"))
-        what = what.replace(" ({turning})", "")
-        shape = f"{entry.axes} {' or '.join(entry.dtype.split())}"
-        cells = (f"`{place}`", shape, ", ".join(text for text in (unit, frame) if text != "-") or "-")
-        rows.append(f"| {' | '.join((*cells, entry.values_text or '-', what))} |")
-    return rows
+    return rows + [f"| {' | '.join(_cells(entry))} |" for entry in entries]
+
+
+def _cells(entry: ArrayEntry) -> tuple[str, ...]:
+    """Return the cells of an array's row: place, shape and type, unit and frame, values, and what it is."""
+    place = entry.name.replace("{", "<").replace("}", ">")
+    unit = "varies" if "{" in entry.unit else entry.unit
+    frame = "image" if "{" in entry.frame else entry.frame
+    what = " ".join(text for text in (entry.text, entry.note) if text and not text.startswith("{"))
+    shape = f"{entry.axes} {' or '.join(entry.dtype.split())}"
+    units = ", ".join(text for text in (unit, frame) if text != "-") or "-"
+    return f"`{place}`", shape, units, entry.values_text or "-", what.replace(" ({turning})", "")

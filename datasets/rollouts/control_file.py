@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -189,9 +189,11 @@ def _read(path: Path, name: str, demo: Node, robot: Literal["finger", "hand"], n
     for table, rows in ((table_of_commands, len(arrays["actions"])), (PLANS, len(arrays["plans/cost"]))):
         for key, entry in table.items():
             wanted = (rows, *(sizes.get(size, size) if isinstance(size, str) else size for size in entry.tail))
-            if arrays[key].shape != wanted:
-                raise InputDataError(
-                    f"{path}: data/{name}/{key} has the shape {arrays[key].shape}.", f"{wanted}.", "take the original."
-                )
+            _require_shape(f"{path}: data/{name}/{key}", arrays[key].shape, wanted)
     ended = str(demo.attrs.get("ended", ""))
     return RunTables(seed=_number(name), ended=ended, arrays=arrays, robot=robot, joints=names)
+
+
+def _require_shape(where: str, found: tuple[int, ...], wanted: tuple[Any, ...]) -> None:
+    if found != wanted:
+        raise InputDataError(f"{where} has the shape {found}.", f"{wanted}.", "take the original.")

@@ -262,13 +262,7 @@ def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] |
         manifest: Its manifest.
         files: Names of the shards whose hash is compared, or None for all; for others only the size is compared.
     """
-    lacking, count = chain.from_iterable(missing_shards(manifest)), missing_count(manifest)
-    faults = [
-        f"{shard_name(index, manifest.shard_count)}: this shard is missing."
-        for index in islice(lacking, LISTED_MISSING)
-    ]
-    if count > LISTED_MISSING:
-        faults.append(f"and {count - LISTED_MISSING} more shards are missing.")
+    faults = _missing_faults(manifest)
     promise = promise_fault(manifest)
     faults += [] if promise is None else [promise]
     found = (shard_fault(path / shard.file, shard, files is None or shard.file in files) for shard in manifest.shards)
@@ -282,6 +276,14 @@ def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] |
     faults += [f"{name}: not listed in {MANIFEST}." for name in extra]
     fault = _model_fault(path, manifest)
     return faults if fault is None else [*faults, fault]
+
+
+def _missing_faults(manifest: DatasetManifest) -> list[str]:
+    """Return one sentence for each of the first shards that are missing, and one for all others."""
+    lacking, count = chain.from_iterable(missing_shards(manifest)), missing_count(manifest)
+    first = islice(lacking, LISTED_MISSING)
+    faults = [f"{shard_name(index, manifest.shard_count)}: this shard is missing." for index in first]
+    return faults + ([f"and {count - LISTED_MISSING} more shards are missing."] if count > LISTED_MISSING else [])
 
 
 def _model_fault(path: Path, manifest: DatasetManifest) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -229,23 +229,12 @@ class RolloutDataset:
         """Return the cameras to read and the names of the arrays."""
         there = self.reader.cameras() if len(self.reader) else []
         names = there if cameras is None else list(cameras)
-        for name in set(names) - set(there):
-            raise UsageError(
-                f"no camera '{name}'.{did_you_mean(name, there)}",
-                ", ".join(there) or "none.",
-                "name one of these cameras.",
-            )
+        _require_cameras(names, there)
         wanted = ["bodies/pos", "bodies/quat_wxyz", "obs/{camera}_image"] if keys is None else keys
         every = [key.replace("{camera}", name) for key in wanted for name in (names if "{camera}" in key else [""])]
         for key in every if len(self.reader) else []:  # before workers start
             self.reader.read(0, key, 0, 1)
-            axes = str(self.reader.group(0)[key].attrs["shape_meaning"])
-            if not axes.startswith("(T,"):
-                raise UsageError(
-                    f"'{key}' has the axes {axes}, so it has no windows of frames.",
-                    "arrays whose first axis is the time.",
-                    "read it by itself: dataset.reader.read(...), or dataset.reader.contacts(...).",
-                )
+            _require_frames(key, str(self.reader.group(0)[key].attrs["shape_meaning"]))
         shown = [name for name in there if any(key.startswith(f"obs/{name}_") for key in every)]
         return shown, every
 
@@ -279,3 +268,22 @@ def _list(handle: Node, file: Path, split: str | None) -> Iterable[RolloutInfo]:
                 f"{file}: data/{name}: num_samples is {frames}.", f"0 to {MOST_FRAMES}.", "write the dataset again."
             )
         yield RolloutInfo(file, name, int(demo.attrs["episode_index"]), frames)
+
+
+def _require_cameras(names: Iterable[str], there: Sequence[str]) -> None:
+    for name in set(names) - set(there):
+        raise UsageError(
+            f"no camera '{name}'.{did_you_mean(name, there)}",
+            ", ".join(there) or "none.",
+            "name one of these cameras.",
+        )
+
+
+def _require_frames(key: str, axes: str) -> None:
+    """Refuse an array without an axis of time."""
+    if not axes.startswith("(T,"):
+        raise UsageError(
+            f"'{key}' has the axes {axes}, so it has no windows of frames.",
+            "arrays whose first axis is the time.",
+            "read it by itself: dataset.reader.read(...), or dataset.reader.contacts(...).",
+        )

@@ -350,15 +350,18 @@ def _require_sizes(demo: Node, path: Path, name: str) -> None:
             todo="copy the file again, or run 'cgwm validate' on the dataset.",
         )
     for camera, entry in demo["cameras"].items() if "cameras" in demo else ():
-        size = tuple(int(entry[key][()]) for key in ("height", "width"))
-        for kind in ("image", "depth", "mask", "amodal"):
-            item = demo.get(f"obs/{camera}_{kind}")
-            if item is not None and item.attrs.get("encoding") != "jpeg" and item.shape[1:3] != size:
-                axes = "(T, H, W, 3)" if kind == "image" else "(T, H, W)"
-                wanted = (item.shape[0], *size, *item.shape[3:])
-                raise InputDataError(
-                    f"{path}, {name}: obs/{camera}_{kind}: its shape is {item.shape}; {axes} is documented, here "
-                    f"{wanted}.",
-                    "images of the size of their camera.",
-                    todo="copy the file again, or run 'cgwm validate' on the dataset.",
-                )
+        _require_pictures(demo, camera, tuple(int(entry[key][()]) for key in ("height", "width")), f"{path}, {name}")
+
+
+def _require_pictures(demo: Node, camera: str, size: tuple[int, ...], where: str) -> None:
+    """Refuse arrays of pictures of another size than that of their camera."""
+    for kind in ("image", "depth", "mask", "amodal"):
+        item = demo.get(f"obs/{camera}_{kind}")
+        if item is not None and item.attrs.get("encoding") != "jpeg" and item.shape[1:3] != size:
+            axes = "(T, H, W, 3)" if kind == "image" else "(T, H, W)"
+            wanted = (item.shape[0], *size, *item.shape[3:])
+            raise InputDataError(
+                f"{where}: obs/{camera}_{kind}: its shape is {item.shape}; {axes} is documented, here {wanted}.",
+                "images of the size of their camera.",
+                todo="copy the file again, or run 'cgwm validate' on the dataset.",
+            )

@@ -169,17 +169,20 @@ def _strange(file: Path, entry: ShardEntry, manifest: DatasetManifest, config_js
         if manifest.versions.get(name) != version:
             yield f"{file.name}: made with {name} {version}; the dataset's is {manifest.versions.get(name, 'none')}."
     with open_shard(file) as handle, hdf5_faults(file):
-        attributes: Node = handle.attrs
-        if int(attributes["seed"]) != manifest.config.get("seed"):
-            yield f"{file.name}: made with seed {attributes['seed']}; the dataset's is {manifest.config.get('seed')}."
-        if attributes["config_json"] != config_json:
-            yield f"{file.name}: made with other settings (its attribute config_json)."
+        yield from _strange_settings(file, handle.attrs, manifest, config_json)
         found = [int(name.removeprefix("demo_")) for name in demo_names(handle)]
     wanted = shard_range(manifest.rollouts, manifest.shard_count, entry.index)
     if not all(number in wanted for number in found):
         yield f"{file.name}: holds the rollouts {ranges(found)}; its number stands for {span(wanted)}."
     if len(found) != entry.rollouts:
         yield f"{file.name}: holds {len(found)} rollouts; its entry says {entry.rollouts}."
+
+
+def _strange_settings(file: Path, attributes: Node, manifest: DatasetManifest, config_json: str) -> Iterator[str]:
+    if int(attributes["seed"]) != manifest.config.get("seed"):
+        yield f"{file.name}: made with seed {attributes['seed']}; the dataset's is {manifest.config.get('seed')}."
+    if attributes["config_json"] != config_json:
+        yield f"{file.name}: made with other settings (its attribute config_json)."
 
 
 def tidied(path: Path) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -96,28 +97,12 @@ def build_model(solid: SolidObject, contact: ContactTruth, fingertip: bool, mat_
         fingertip: Whether there is a fingertip, on three slide joints.
         mat_half: Half the side of the textured mat [m]; rays beyond it hit nothing; the collision plane is infinite.
     """
-    assets, geoms, names = [], [], []
-    for index, part in enumerate(solid.parts):
-        name = f"part{index}"
-        names.append(name)
-        middle, half = (part.max(axis=0) + part.min(axis=0)) / 2, (part.max(axis=0) - part.min(axis=0)) / 2
-        if np.allclose(np.abs(part - middle), half):
-            form = f'type="box" pos="{_text(middle)}" size="{_text(half)}"'
-        else:
-            assets.append(f'<mesh name="{name}" vertex="{_text(part.ravel())}"/>')
-            form = f'type="mesh" mesh="{name}"'
-        geoms.append(f'<geom name="{name}" {form} group="{BODY_GROUP}" contype="0" conaffinity="0"/>')
+    names = [f"part{index}" for index in range(len(solid.parts))]
+    assets, geoms = _parts(solid, names)
     moments = solid.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     pairs = [_pair(name, "ground", contact.friction, contact) for name in names]
-    tip = ""
     if fingertip:
         pairs += [_pair(name, FINGERTIP, contact.friction_fingertip, contact) for name in names]
-        joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
-        tip = (
-            f'<body name="{FINGERTIP}" gravcomp="1">{joints}<geom name="{FINGERTIP}" type="sphere" '
-            f'size="{FINGERTIP_RADIUS}" mass="{_FINGERTIP_MASS}" group="{BODY_GROUP}" '
-            f'contype="0" conaffinity="0"/></body>'
-        )
     xml = f"""<mujoco>
       <option timestep="{1 / STEPS_PER_S!r}" gravity="0 0 {-GRAVITY}" integrator="RK4" cone="elliptic" impratio="20"
         tolerance="1e-12" iterations="50"/>
@@ -130,11 +115,35 @@ def build_model(solid: SolidObject, contact: ContactTruth, fingertip: bool, mat_
           <inertial pos="{_text(solid.com)}" mass="{solid.mass}" fullinertia="{_text(moments)}"/>
           {"".join(geoms)}
         </body>
-        {tip}
+        {_tip() if fingertip else ""}
       </worldbody>
       <contact>{"".join(pairs)}</contact>
     </mujoco>"""
     return mujoco.MjModel.from_xml_string(xml)
+
+
+def _parts(solid: SolidObject, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the meshes and the geoms of an object's parts; one that is a box along the axes is no mesh."""
+    assets, geoms = [], []
+    for name, part in zip(names, solid.parts, strict=True):
+        middle, half = (part.max(axis=0) + part.min(axis=0)) / 2, (part.max(axis=0) - part.min(axis=0)) / 2
+        if np.allclose(np.abs(part - middle), half):
+            form = f'type="box" pos="{_text(middle)}" size="{_text(half)}"'
+        else:
+            assets.append(f'<mesh name="{name}" vertex="{_text(part.ravel())}"/>')
+            form = f'type="mesh" mesh="{name}"'
+        geoms.append(f'<geom name="{name}" {form} group="{BODY_GROUP}" contype="0" conaffinity="0"/>')
+    return assets, geoms
+
+
+def _tip() -> str:
+    """Return the fingertip on its slides."""
+    joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    return (
+        f'<body name="{FINGERTIP}" gravcomp="1">{joints}<geom name="{FINGERTIP}" type="sphere" '
+        f'size="{FINGERTIP_RADIUS}" mass="{_FINGERTIP_MASS}" group="{BODY_GROUP}" '
+        f'contype="0" conaffinity="0"/></body>'
+    )
 
 
 def simulate(

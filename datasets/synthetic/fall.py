@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -71,9 +71,7 @@ def _toss(
 
     for _ in range(_TRIES):
         qpos, qvel = _release(rng, solid)
-        if any(turned_deg(qpos[3:7], other) < 35 for other in others):
-            continue
-        if qpos[2] < lowest(solid, qpos[3:7]) + _LOWEST_RELEASE_M:
+        if not _is_new_and_high(qpos, solid, others):
             continue
         motion = simulate(model, qpos, qvel, -EXPOSURE_LEAD_S, duration)
         wanted = _instructive(motion) if split == "train" else _settles(motion)
@@ -88,6 +86,12 @@ def _toss(
             f"scene fall: none of {_TRIES} tosses of the {solid.family} stays in view.", todo="choose another seed."
         )
     return min(useful, key=lambda one: one[0])[1]
+
+
+def _is_new_and_high(qpos: Array, solid: SolidObject, others: Sequence[Array]) -> bool:
+    """Return whether a release is turned otherwise than those before, and high enough over the ground."""
+    alike = any(turned_deg(qpos[3:7], other) < 35 for other in others)
+    return not alike and qpos[2] >= lowest(solid, qpos[3:7]) + _LOWEST_RELEASE_M
 
 
 def _release(rng: np.random.Generator, solid: SolidObject) -> tuple[Array, Array]:

@@ -13,13 +13,13 @@ physical and in no list of cases; it serves to study the effect of a wrong simul
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..friction import CoulombFriction
-from .mechanics import STEP_S, Hidden, Mechanics, Motion, Reader, Start
+from .mechanics import STEP_S, Hidden, Mechanics, Moment, Motion, Reader, Start
 from .things import Array, Thing
 
 mujoco: Any = importlib.import_module("mujoco")
@@ -55,10 +55,7 @@ def simulate(mechanics: Mechanics, hidden: Sequence[Hidden], start: Start, lengt
             pressed = _pressed(model, data, len(model.pair_dim))
             moment = reader.moment(step * STEP_S, data.qpos[:3], data.qpos[3:], data.qvel[:3], data.qvel[3:], pressed)
             for touch in touches:
-                ratio = model.pair_solref[:, 1].copy()
-                touch(moment, model.pair_friction[:, :2], ratio)
-                model.pair_solref[:, 0] = mechanics.thing.natural_time_s / ratio
-                model.pair_solref[:, 1] = ratio
+                _change_contact(model, mechanics, touch, moment)
             if pushes:
                 force, torque = (np.sum(parts, axis=0) for parts in zip(*(p(moment) for p in pushes), strict=True))
                 data.xfrc_applied[1, :3], data.xfrc_applied[1, 3:] = force, torque
@@ -68,6 +65,16 @@ def simulate(mechanics: Mechanics, hidden: Sequence[Hidden], start: Start, lengt
     if not np.isfinite(poses).all():
         raise ArithmeticError("MuJoCo's motion is not finite")
     return Motion(np.arange(count, dtype=np.float64) * STEP_S, poses[:, :3], poses[:, 3:], touching)
+
+
+def _change_contact(
+    model: Any, mechanics: Mechanics, touch: Callable[[Moment, Array, Array], None], moment: Moment
+) -> None:
+    """Set friction and damping of all pairs as an effect wants them."""
+    ratio = model.pair_solref[:, 1].copy()
+    touch(moment, model.pair_friction[:, :2], ratio)
+    model.pair_solref[:, 0] = mechanics.thing.natural_time_s / ratio
+    model.pair_solref[:, 1] = ratio
 
 
 def _pressed(model: Any, data: Any, count: int) -> Array:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from collections.abc import Sequence
+from itertools import chain, combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,23 +28,10 @@ _GROUND_COLOR = (0.52, 0.55, 0.57)
 
 def build_model(plan: WorldPlan) -> MjModel:
     """Build the MuJoCo model: the ground, the surfaces, and the bodies with free joints in their order."""
-    fixed = {"ground": plan.ground.material or ""} if plan.ground is not None else {}
-    fixed |= {surface.name: surface.material or "" for surface in plan.surfaces}
     parts = {thing.name: _geoms(thing) for thing in plan.things}
     assets = "".join(asset for geoms in parts.values() for _, asset, _ in geoms)
     bodies = "".join(_body(thing, [form for _, _, form in parts[thing.name]]) for thing in plan.things)
-    pairs = [
-        _pair(plan, geom, other, (material, plan.material))
-        for geoms in parts.values()
-        for geom, _, _ in geoms
-        for other, material in fixed.items()
-    ]
-    pairs += [
-        _pair(plan, geom, other, (plan.material, plan.material))
-        for geoms, others in combinations(parts.values(), 2)
-        for geom, _, _ in geoms
-        for other, _, _ in others
-    ]
+    pairs = _pairs(plan, [[name for name, _, _ in geoms] for geoms in parts.values()])
     surfaces = "".join(_surface(surface) for surface in plan.surfaces)
     ground = f'<geom name="ground" type="plane" size="{_GROUND_HALF_M} {_GROUND_HALF_M} 0.1" {_flags(GROUND_GROUP)}/>'
     return mujoco.MjModel.from_xml_string(f"""<mujoco>
@@ -54,6 +42,16 @@ def build_model(plan: WorldPlan) -> MjModel:
       <worldbody>{ground if plan.ground is not None else ""}{surfaces}{bodies}</worldbody>
       <contact>{"".join(pairs)}</contact>
     </mujoco>""")
+
+
+def _pairs(plan: WorldPlan, geoms: Sequence[Sequence[str]]) -> list[str]:
+    """Return the pairs of the geoms of each body with what is fixed, and with those of the others."""
+    fixed = {"ground": plan.ground.material or ""} if plan.ground is not None else {}
+    fixed |= {surface.name: surface.material or "" for surface in plan.surfaces}
+    on_fixed = product(chain.from_iterable(geoms), fixed.items())
+    found = [_pair(plan, geom, other, (material, plan.material)) for geom, (other, material) in on_fixed]
+    between = chain.from_iterable(product(some, others) for some, others in combinations(geoms, 2))
+    return found + [_pair(plan, geom, other, (plan.material, plan.material)) for geom, other in between]
 
 
 def simulate(plan: WorldPlan, model: MjModel, episode: WorldEpisode, rate_hz: int) -> Array:
