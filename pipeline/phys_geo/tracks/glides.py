@@ -11,7 +11,10 @@ and the only unknown beside the losses is the start of each such part. Frames ar
 all joints move on, so that s is known. It tells losses by mass, of which the file's is taken, and nothing where a body
 does not glide: then they are not observable.
 
-The motion is linear in the losses, while their logarithms have priors: draws as in `loss_posterior.py`.
+The motion is linear in the losses, so that their likelihood is a normal density where they are positive. Where a part
+tells friction + damping * speed alone, a prior for logarithms would say how the two share it; so all losses weigh alike
+here, and intervals are those of this truncated density. A loss of which it tells a limit alone is not observable.
+Contact time and damping ratio of what pushes are told by depths, too: without forces they are not observable.
 """
 
 from __future__ import annotations
@@ -24,13 +27,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 from torch import Tensor
 
 from ....datasets.capture.tracks import Episode
 from ....schemas.materials import of_pair
 from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
+from ...optimization.uncertainty import REACH
 from ...physics.chains.parameters import LOSSES, chain_parameters
-from ...physics.parameters import CONTACT_TIME, DAMPING_RATIO, GAP, Parameter, gap_parameters
+from ...physics.parameters import CONTACT_TIME, DAMPING_RATIO, Parameter
 from ...physics.world import World
 from ...trajectories.initial_state import clearance
 from ...trajectories.observations import Observations
@@ -49,7 +54,6 @@ from .driven_joints import (
 from .driven_result import DrivenFit
 from .force_driven import NEAR_M, ForceDriven, Grid
 from .joint_tracks import JointTracks
-from .loss_posterior import posterior
 
 FEWEST_FRAMES = 4
 """Frames of the shortest part: two are its start."""
@@ -60,6 +64,12 @@ LAG_S = 0.03
 OPEN = 100.0
 """Factor on the width of the prior of a start, which is that of a straight line: a part may be few frames long, over
 which losses take most of the speed."""
+WEAK = 1e-3
+"""Information, as a root, that makes the density of losses one where the data tell nothing, in their units."""
+LIMIT_ALONE = 50.0
+"""Ratio of the ends of an interval from which on a loss is not observable: it is 71 where a limit alone is told."""
+WALKERS, SWEEPS = 400, 400
+"""Draws at a time, and their sweeps, of which the second half counts."""
 Part = tuple[Episode, tuple[float, float]]
 """An episode, and the times of the first and the last frame of a part of it [s]."""
 
@@ -90,19 +100,14 @@ def fit_gliding_joints(world: World, episodes: Sequence[Episode], noise: Noise) 
         covariance=covariance,
         pressed=[],
         record=record,
-        open=_laws_of_flat_faces(world),
+        open=_laws_of_what_pushes(world),
     )
 
 
-def _laws_of_flat_faces(world: World) -> frozenset[str]:
-    """Return the names of contact times and damping ratios of links and driven bodies whose size is not fitted.
-
-    Depths tell them, and a size that is off by 0.2 mm is deeper than most contacts.
-    """
-    fitted = {p.name for p in gap_parameters(world)}
+def _laws_of_what_pushes(world: World) -> frozenset[str]:
+    """Return the names of contact times and damping ratios of links and driven bodies."""
     driven = [k for k, body in enumerate(world.bodies) if body.name in world.driven]
-    flat = [k for k in driven if f"{world.bodies[k].name}.{GAP.name}" not in fitted]
-    pairs = [world.materials_of(link, k) for k in flat for link in world.tracked]
+    pairs = [world.materials_of(link, k) for k in driven for link in world.tracked]
     return frozenset(of_pair(p.name, pair) for p in (CONTACT_TIME, DAMPING_RATIO) for pair in pairs)
 
 
@@ -248,14 +253,58 @@ def _fitted(data: _Parts) -> tuple[NDArray[np.float64], NDArray[Any], dict[str, 
     assert best is not None
     misfit = _misfit(data, best)
     over = max(1.0, misfit)
-    values, covariance = posterior(
-        best.shared.numpy(),
-        data.units.numpy(),
-        best.information.numpy() / over,
-        best.scores.sum(0).numpy() / over,
-        data.parameters,
-    )
+    information, slope = best.information.numpy() / over, best.scores.sum(0).numpy() / over
+    values, covariance = _posterior(data, best.shared.numpy(), information, slope)
     return values, covariance, {"misfit": misfit, "information_over": over, "converged": best.converged}
+
+
+def _posterior(
+    data: _Parts, best: NDArray[np.float64], information: NDArray[Any], slope: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[Any]]:
+    """Return middle (P,) and covariance (P, P) of the intervals in fitted coordinates, with priors for untold losses.
+
+    Args:
+        data: The parts.
+        best: The end of the descent: losses in their units, and logarithms of factors, shape (P,).
+        information: Of the data on these coordinates there, shape (P, P).
+        slope: Of the logarithm of the data's likelihood there, shape (P,).
+    """
+    units, names = data.units.numpy(), data.parameters
+    linear, width = units > 0, np.array([p.prior[1] for p in names])
+    precision = information + np.diag(np.where(linear, WEAK, 1 / width) ** 2)
+    middle = best + np.linalg.solve(precision, slope + np.where(linear, 0.0, -best / width**2))
+    draws = positive_draws(middle, precision, linear)
+    z = np.where(linear, np.log(np.where(linear, draws * np.where(linear, units, 1.0), 1.0)), draws)
+    low, high = np.quantile(z, [0.025, 0.975], axis=0)
+    std = (high - low) / (2 * REACH)
+    covariance = np.corrcoef(z.T).reshape(len(std), -1) * np.outer(std, std)
+    values = 0.5 * (low + high)
+    for k in np.flatnonzero(linear & (high - low > math.log(LIMIT_ALONE))).tolist():
+        values[k], covariance[k], covariance[:, k] = names[k].encode(names[k].prior[0]), 0.0, 0.0
+        covariance[k, k] = width[k] ** 2
+    return values, covariance
+
+
+def positive_draws(
+    middle: NDArray[np.float64], precision: NDArray[Any], positive: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return draws (N, P) of a normal density, of which some coordinates are positive, by Gibbs' sampler."""
+    rng = np.random.default_rng(0)
+    own = np.diag(precision)
+    std = own**-0.5
+    draws, kept = np.where(positive, np.abs(middle) + 1e-9, middle) + np.zeros((WALKERS, len(middle))), []
+    for sweep in range(SWEEPS):
+        for k in range(len(middle)):
+            away = (draws - middle) @ precision[k] - own[k] * (draws[:, k] - middle[k])
+            mean = middle[k] - away / own[k]
+            least = ndtr(-mean / std[k]) if positive[k] else np.zeros(WALKERS)
+            share = least + (1 - least) * rng.random(WALKERS)
+            draws[:, k] = mean + std[k] * ndtri(np.clip(share, 1e-16, 1 - 1e-16))
+            if positive[k]:
+                draws[:, k] = np.maximum(draws[:, k], 1e-9 * std[k])
+        if sweep >= SWEEPS // 2:
+            kept.append(draws.copy())
+    return np.concatenate(kept)
 
 
 def _misfit(data: _Parts, end: Solution) -> float:

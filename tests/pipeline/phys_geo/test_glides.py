@@ -7,14 +7,14 @@ import torch
 from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate
-from cgwm.pipeline.phys_geo.tracks.glides import fit_gliding_joints, free_runs, moves_on, roughness
+from cgwm.pipeline.phys_geo.tracks.glides import fit_gliding_joints, free_runs, moves_on, positive_draws, roughness
 from cgwm.pipeline.physics.chains.chain import Chain, Joint
 from cgwm.pipeline.physics.chains.parameters import chain_parameters
 from cgwm.pipeline.physics.parameters import contact_parameters
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.chains import chained, link
-from helpers.worlds import F64, ball_body, law, plate_body
+from helpers.worlds import F64, ball_body, law
 
 MASS, DAMPING, FRICTION = 2.0, 4.0, 3.0
 NOISE = Noise(1e-4, 1e-3)
@@ -73,17 +73,26 @@ def test_a_drawer_that_goes_with_the_finger_tells_nothing() -> None:
     np.testing.assert_allclose(left.covariance, np.diag([p.prior[1] ** 2 for p in losses]))
 
 
-def test_a_plate_leaves_contact_time_and_damping_ratio_open() -> None:
-    """Its size is not fitted, as that of a ball is, and depths tell them."""
-    ball = fit_gliding_joints(world(), [shove(0, glides=False)], NOISE)
-    plate = replace(plate_body((0.01, 0.01, 0.01)), name="finger", motion="driven")
-    flat = replace(world(), bodies=(*world().bodies[:-1], plate))
-    found = fit_gliding_joints(flat, [shove(0, glides=False)], NOISE)
-    assert ball is not None and found is not None and not ball.open
-    names = contact_parameters(flat)
+def test_the_law_of_what_pushes_is_left_open() -> None:
+    """Depths tell contact time and damping ratio, in which the size and path of the finger count as exact."""
+    found = fit_gliding_joints(world(), [shove(0, glides=False)], NOISE)
+    assert found is not None
+    names = contact_parameters(world())
     searched = ContactEstimate(parameters=names, values=np.zeros(len(names)), covariance=0.01 * np.eye(len(names)))
     left = np.sqrt(np.diag(found.leave_open(searched).covariance))
     np.testing.assert_allclose(left, [0.1, *(p.prior[1] for p in names[1:])])
+
+
+def test_draws_of_a_truncated_density() -> None:
+    """Of a loss about which only a limit is known, the ends of the interval differ by a factor of 71."""
+    draws = positive_draws(np.array([0.0, 5.0, -3.0]), np.diag([4.0, 1.0, 1.0]), np.array([True, False, True]))
+    low, high = np.quantile(draws, [0.025, 0.975], axis=0)
+    assert 60 < high[0] / low[0] < 85 and abs(high[0] - 0.5 * 2.24) < 0.03
+    assert abs(draws[:, 1].mean() - 5) < 0.03 and abs(draws[:, 1].std() - 1) < 0.03
+    assert abs(draws[:, 2].mean() - (-3 + 0.004432 / 0.00135)) < 0.03  # the hazard of a normal density at 3
+    both = np.array([[1.0, 0.9], [0.9, 1.0]])
+    along = positive_draws(np.array([1.0, 1.0]), np.linalg.inv(both * 0.01), np.array([True, True]))
+    np.testing.assert_allclose(np.cov(along.T), 0.01 * both, atol=4e-4)
 
 
 def test_worlds_that_are_left_to_the_search() -> None:
