@@ -265,7 +265,7 @@ class Structure:
         if wanted.gathered:
             wide = max(lanes, WARP)
             for crowd, each in product(CROWDS, (wide, *(fewer for fewer in (128, 64, WARP) if fewer < wide))):
-                found = replace(self, lanes=each, crowd=min(crowd, self.contacts))
+                found = replace(self, lanes=each, crowd=max(1, min(crowd, self.contacts)))  # no array is empty
                 if _block_bytes(found) <= room:
                     return found
             return self.on_lanes(1)

@@ -318,6 +318,32 @@ def test_a_block_has_room_for_as_many_contacts_as_its_memory_holds() -> None:
         require_room(found[4])
 
 
+def door() -> Case:
+    """Return a leaf with the hull of a box on a hinge with losses, which touches nothing."""
+    hinge = Joint.of("hinge", "hinge", "leaf", "frame", axis=(0, 1, 0), damping=1e-3, friction=1e-3)
+    leaf = boxed(link("leaf", 0.2, com=(0.1, 0, 0)), (0.1, 0.05, 0.01))
+    world = chained(
+        Chain(name="door", root="frame", base="fixed", joints=(hinge,)), link("frame", 0.0), leaf, ground=False
+    )
+    return world, with_joints(world, still(2), {"hinge": 0.2}, {"hinge": 1.0}), {}
+
+
+def test_hulls_that_touch_nothing_have_room_for_a_contact() -> None:
+    """Kernels of a GPU have no empty arrays."""
+    world, state, _ = door()
+    alone = pack(world, state, times(0.01), {}, False).structure
+    assert alone.hulled and alone.contacts == 0 and alone.on_lanes(32).crowd == 1
+
+
+@NEEDS_GPU
+def test_hulls_that_touch_nothing_swing_on_a_gpu() -> None:
+    world, state, _ = door()
+    when = times(0.4, 20.0)
+    expected, found = simulate(world, state, when), on_cuda(world, state, when, {}, lanes=32)
+    for name in POSES:
+        np.testing.assert_allclose(getattr(found, name).cpu(), getattr(expected, name), atol=1e-9, err_msg=name)
+
+
 def test_environments_of_a_block_are_as_many_as_its_memory_holds() -> None:
     short, middle, endless = (long_chain(links) for links in (3, 10, 150))
     assert [short.on_lanes(lanes).lanes for lanes in (1, 4, 32)] == [1, 4, 32]
