@@ -15,7 +15,7 @@ from ..io.outputs import reads
 from ..io.progress import progress
 from .photo_captures import write_photo_capture
 from .realsense_file import RealSenseFile, StreamGeometry, opened
-from .walk_video import FEWEST, choose, measured, require_walk
+from .walk_video import measured, sharp_frames
 
 Array = NDArray[np.float64]
 
@@ -47,13 +47,7 @@ def import_realsense(source: Path | str, out: Path | str, photos: int = 60, over
         color = recording.stream("Color")
         if color is None:
             raise InputDataError(f"{source}: no colour stream.", todo="record with colour (and depth) switched on.")
-        figures = measured(recording.colors(color))
-        require_walk(source, figures)
-        chosen, blurred = choose(figures, photos)
-        if len(chosen) < FEWEST:
-            raise InputDataError(
-                f"{source}: {len(chosen)} sharp frames.", f"at least {FEWEST}.", "record a longer, slower walk."
-            )
+        chosen, blurred = sharp_frames(source, measured(recording.colors(color)), photos)
         (directory / "images").mkdir()
         for k, frame in zip(chosen, recording.colors(color, set(chosen)), strict=True):
             write_image(directory / "images" / f"{k:06d}.jpg", np.ascontiguousarray(frame[:, :, ::-1]), 97)

@@ -64,18 +64,23 @@ def import_video(source: Path | str, out: Path | str, photos: int = 60, overwrit
     source = Path(source)
     with new_directory(out, "capture", overwrite) as directory:
         require_regular_file(source)
-        figures = measured(frames_of(source))
-        require_walk(source, figures)
-        chosen, blurred = choose(figures, photos)
-        if len(chosen) < FEWEST:
-            raise InputDataError(
-                f"{source}: {len(chosen)} sharp frames.", f"at least {FEWEST}.", "record a longer, slower walk."
-            )
+        chosen, blurred = sharp_frames(source, measured(frames_of(source)), photos)
         _write(source, directory, chosen)
         notes = ["a phone reads a picture row by row (rolling shutter), which bends fast turns: walk slowly"]
         if blurred:
             notes.append(f"{blurred} of {photos} parts of the video have no sharp frame")
         return write_photo_capture(directory, out, len(chosen), warnings=notes)
+
+
+def sharp_frames(source: Path, figures: FrameFigures, most: int) -> tuple[list[int], int]:
+    """Return the frames of a walk to take, and the number of its parts that have no sharp one; refuse too few."""
+    require_walk(source, figures)
+    chosen, blurred = choose(figures, most)
+    if len(chosen) < FEWEST:
+        raise InputDataError(
+            f"{source}: {len(chosen)} sharp frames.", f"at least {FEWEST}.", "record a longer, slower walk."
+        )
+    return chosen, blurred
 
 
 def require_walk(source: Path, figures: FrameFigures) -> None:

@@ -178,12 +178,3 @@ def linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def quat_of(rotation: NDArray[Any]) -> NDArray[np.float64]:
     """Return the quaternion w x y z (4,) of a rotation matrix (3, 3)."""
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-
-
-def turn_from_z(normal: Any) -> NDArray[np.float64]:
-    """Return the quaternion w x y z (4,) of the shortest rotation that takes z to a unit normal (3,)."""
-    x, y, z = normal
-    if z < -1 + 1e-9:
-        return np.array([0.0, 1.0, 0.0, 0.0])
-    quat = np.array([1 + z, -y, x, 0.0])
-    return quat / np.linalg.norm(quat)

@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from ...datasets.models.model import Model
+from ...datasets.shapes.turns import quat_of_normal
 from ...schemas import CgwmError, NotConvergedError, UsageError
 from ..rendering.contact_glyphs import SLIDING_RGB, STICKING_RGB
 from .door import Door, guarded, require_closed
@@ -29,7 +30,6 @@ from .scene_nodes import (
     add_surface,
     as_bytes,
     place_marks,
-    turn_from_z,
     vertical_angle_rad,
 )
 
@@ -192,7 +192,9 @@ class Viewer:
         if background is None and ground is not None:
             place = np.asarray(ground.normal) * ground.offset_m
             side = 20 * size
-            scene.add_grid("/ground", side, side, cell_size=size, wxyz=turn_from_z(ground.normal), position=place)
+            scene.add_grid(
+                "/ground", side, side, cell_size=size, wxyz=quat_of_normal(np.asarray(ground.normal)), position=place
+            )
         self._surfaces = [
             add_surface(scene, one, model.surface_meshes.get(one.name), size) for one in model.file.surfaces
         ]
