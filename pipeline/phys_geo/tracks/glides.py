@@ -12,8 +12,8 @@ all joints move on, so that s is known. It tells losses by mass, of which the fi
 does not glide: then they are not observable.
 
 The motion is linear in the losses, so that their likelihood is a normal density where they are positive. Where a part
-tells friction + damping * speed alone, a prior for logarithms would say how the two share it; so all losses weigh alike
-here, and intervals are those of this truncated density. A loss of which it tells a limit alone is not observable.
+tells friction + damping * speed alone, a prior for logarithms would say how the two share it; so intervals
+are those of the profile of the likelihood here. A loss of which it tells a limit alone is not observable.
 Contact time and damping ratio of what pushes are told by depths, too: without forces they are not observable.
 """
 
@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
+from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from ....datasets.capture.tracks import Episode
@@ -67,9 +67,9 @@ which losses take most of the speed."""
 WEAK = 1e-3
 """Information, as a root, that makes the density of losses one where the data tell nothing, in their units."""
 LIMIT_ALONE = 50.0
-"""Ratio of the ends of an interval from which on a loss is not observable: it is 71 where a limit alone is told."""
-WALKERS, SWEEPS = 400, 400
-"""Draws at a time, and their sweeps, of which the second half counts."""
+"""Ratio of the ends of an interval from which on a loss is not observable: the lower one is 0 where a limit is told."""
+BISECTIONS, TINY = 30, 1e-12
+"""Halvings of the place of an end, and the least loss [SI], whose logarithm stands for that of none."""
 Part = tuple[Episode, tuple[float, float]]
 """An episode, and the times of the first and the last frame of a part of it [s]."""
 
@@ -273,38 +273,52 @@ def _posterior(
     linear, width = units > 0, np.array([p.prior[1] for p in names])
     precision = information + np.diag(np.where(linear, WEAK, 1 / width) ** 2)
     middle = best + np.linalg.solve(precision, slope + np.where(linear, 0.0, -best / width**2))
-    draws = positive_draws(middle, precision, linear)
-    z = np.where(linear, np.log(np.where(linear, draws * np.where(linear, units, 1.0), 1.0)), draws)
-    low, high = np.quantile(z, [0.025, 0.975], axis=0)
-    std = (high - low) / (2 * REACH)
-    covariance = np.corrcoef(z.T).reshape(len(std), -1) * np.outer(std, std)
-    values = 0.5 * (low + high)
-    for k in np.flatnonzero(linear & (high - low > math.log(LIMIT_ALONE))).tolist():
+    inside = np.where(linear, 0.0, -np.inf)
+    ends = np.array([interval(middle, precision, inside, k) for k in range(len(middle))])
+    ends[linear] = np.log(np.maximum(ends[linear] * units[linear, None], TINY))
+    std = (ends[:, 1] - ends[:, 0]) / (2 * REACH)
+    both = np.linalg.inv(precision)
+    own = np.sqrt(np.diag(both))
+    covariance, values = both / np.outer(own, own) * np.outer(std, std), ends.mean(1)
+    for k in np.flatnonzero(linear & (ends[:, 1] - ends[:, 0] > math.log(LIMIT_ALONE))).tolist():
         values[k], covariance[k], covariance[:, k] = names[k].encode(names[k].prior[0]), 0.0, 0.0
         covariance[k, k] = width[k] ** 2
     return values, covariance
 
 
-def positive_draws(
-    middle: NDArray[np.float64], precision: NDArray[Any], positive: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """Return draws (N, P) of a normal density, of which some coordinates are positive, by Gibbs' sampler."""
-    rng = np.random.default_rng(0)
-    own = np.diag(precision)
-    std = own**-0.5
-    draws, kept = np.where(positive, np.abs(middle) + 1e-9, middle) + np.zeros((WALKERS, len(middle))), []
-    for sweep in range(SWEEPS):
-        for k in range(len(middle)):
-            away = (draws - middle) @ precision[k] - own[k] * (draws[:, k] - middle[k])
-            mean = middle[k] - away / own[k]
-            least = ndtr(-mean / std[k]) if positive[k] else np.zeros(WALKERS)
-            share = least + (1 - least) * rng.random(WALKERS)
-            draws[:, k] = mean + std[k] * ndtri(np.clip(share, 1e-16, 1 - 1e-16))
-            if positive[k]:
-                draws[:, k] = np.maximum(draws[:, k], 1e-9 * std[k])
-        if sweep >= SWEEPS // 2:
-            kept.append(draws.copy())
-    return np.concatenate(kept)
+def interval(
+    middle: NDArray[np.float64], precision: NDArray[Any], least: NDArray[np.float64], k: int
+) -> tuple[float, float]:
+    """Return the interval of coordinate k of a normal likelihood, whose others take the best values above `least`.
+
+    The profile of the likelihood falls by half of the square of `REACH` from its highest value to the ends.
+    """
+    root = np.linalg.cholesky(precision).T
+    others = [j for j in range(len(middle)) if j != k]
+
+    def height(value: float) -> float:
+        wanted = root @ middle - root[:, k] * value
+        if not others:
+            return float(np.square(wanted).sum())
+        bounds = (least[others], np.full(len(others), np.inf))
+        return 2 * float(lsq_linear(root[:, others], wanted, bounds).cost)
+
+    best = lsq_linear(root, root @ middle, (least, np.full(len(middle), np.inf)))
+    limit, at = 2 * float(best.cost) + REACH**2, float(best.x[k])
+    std = float(np.linalg.inv(precision)[k, k] ** 0.5)
+    ends = []
+    for side in (-1, 1):
+        near, far = at, at + side * std * (REACH + 1 + abs(at - middle[k]) / std)
+        far = max(far, least[k])
+        while side > 0 and height(far) < limit:
+            far += far - near
+        if side < 0 and height(far) <= limit:
+            near = far
+        for _ in range(BISECTIONS):
+            half = 0.5 * (near + far)
+            near, far = (half, far) if height(half) < limit else (near, half)
+        ends.append(near)
+    return ends[0], ends[1]
 
 
 def _misfit(data: _Parts, end: Solution) -> float:

@@ -7,7 +7,7 @@ import torch
 from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.pipeline.phys_geo.tracks.contact_result import ContactEstimate
-from cgwm.pipeline.phys_geo.tracks.glides import fit_gliding_joints, free_runs, moves_on, positive_draws, roughness
+from cgwm.pipeline.phys_geo.tracks.glides import fit_gliding_joints, free_runs, interval, moves_on, roughness
 from cgwm.pipeline.physics.chains.chain import Chain, Joint
 from cgwm.pipeline.physics.chains.parameters import chain_parameters
 from cgwm.pipeline.physics.parameters import contact_parameters
@@ -83,16 +83,19 @@ def test_the_law_of_what_pushes_is_left_open() -> None:
     np.testing.assert_allclose(left, [0.1, *(p.prior[1] for p in names[1:])])
 
 
-def test_draws_of_a_truncated_density() -> None:
-    """Of a loss about which only a limit is known, the ends of the interval differ by a factor of 71."""
-    draws = positive_draws(np.array([0.0, 5.0, -3.0]), np.diag([4.0, 1.0, 1.0]), np.array([True, False, True]))
-    low, high = np.quantile(draws, [0.025, 0.975], axis=0)
-    assert 60 < high[0] / low[0] < 85 and abs(high[0] - 0.5 * 2.24) < 0.03
-    assert abs(draws[:, 1].mean() - 5) < 0.03 and abs(draws[:, 1].std() - 1) < 0.03
-    assert abs(draws[:, 2].mean() - (-3 + 0.004432 / 0.00135)) < 0.03  # the hazard of a normal density at 3
-    both = np.array([[1.0, 0.9], [0.9, 1.0]])
-    along = positive_draws(np.array([1.0, 1.0]), np.linalg.inv(both * 0.01), np.array([True, True]))
-    np.testing.assert_allclose(np.cov(along.T), 0.01 * both, atol=4e-4)
+def test_ends_of_an_interval_where_others_are_positive() -> None:
+    """Of x + y = 1 +- 0.1 and y = -1 +- 1, with y >= 0, x is 1 at most; the lower end is where y takes the rest."""
+    least = np.array([-np.inf, 0.0])
+    rows = np.array([[10.0, 10.0], [0.0, 1.0]])
+    middle = np.linalg.solve(rows, [10.0, -1.0])
+    low, high = interval(middle, rows.T @ rows, least, 0)
+    assert abs(high - 1.196) < 1e-3
+    limit = 1 + 1.96**2
+    y = np.linspace(0, 3, 200_001)
+    best = np.array([(np.square(10 * (x + y - 1)) + (y + 1) ** 2).min() - limit for x in (low - 1e-3, low + 1e-3)])
+    assert best[0] > 0 > best[1]
+    assert interval(np.array([0.1]), np.eye(1), np.zeros(1), 0)[0] == 0
+    np.testing.assert_allclose(interval(np.array([5.0]), np.eye(1), np.zeros(1), 0), [3.04, 6.96], atol=1e-3)
 
 
 def test_worlds_that_are_left_to_the_search() -> None:
