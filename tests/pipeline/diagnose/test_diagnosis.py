@@ -12,8 +12,9 @@ import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.diagnose import diagnose, stage
 from cgwm.pipeline.diagnose.contact.flight_equals import fitted_contact, resolved_flight, separated
+from cgwm.pipeline.diagnose.evidence import falsification
 from cgwm.pipeline.diagnose.evidence.effect_selection import SelectionStep, are_slight, repeats, select_next
-from cgwm.pipeline.diagnose.evidence.evidence import Evidence, falsification
+from cgwm.pipeline.diagnose.evidence.evidence import Evidence
 from cgwm.pipeline.diagnose.evidence.falsification import consistency, fitted_numbers, repetition
 from cgwm.pipeline.diagnose.evidence.score_test import ScoreTest, score_test
 from cgwm.pipeline.diagnose.flight import search as flight_search
@@ -194,7 +195,8 @@ def test_what_patches_up_the_law_of_another_is_no_second_effect(
     slots = []
     for name, cost in zip(("quadratic_drag", "gravity_tilt"), costs, strict=True):
         refitted = SimpleNamespace(cost=cost, world=world, segments=[prepared.flight])
-        slots.append(SelectionStep((), (SimpleNamespace(name=name, refitted=refitted),), True))  # pyright: ignore
+        one = SimpleNamespace(name=name, refitted=refitted, repetition=None)
+        slots.append(SelectionStep((), (one,), True))  # pyright: ignore[reportArgumentType]
     last, first = SelectionStep((), (SimpleNamespace(name="wind", refitted=None),), False), iter(slots)  # pyright: ignore
     monkeypatch.setattr(flight_search, "select_next", lambda *_: next(first, last))
     losses = iter((3.0, 2.0))
