@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
-BUDGET_S = 500.0
-"""Processor time that the whole suite may take, imports of two workers included: below five minutes of two cores."""
-REFERENCE_S = 0.018
+BUDGET_S = 400.0
+"""Processor time that the whole suite may take, imports of two workers included: 4.6 of five minutes of two cores, as
+343 s of it took 236 s with empty caches where the reference was measured."""
+REFERENCE_S = 0.012
 """What the reference computation takes beside the tests where the budget was measured, nothing else running."""
 EVERY_S = 10.0
 """Processor time between two reference computations."""
