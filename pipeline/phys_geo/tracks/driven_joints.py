@@ -20,7 +20,7 @@ It takes a jointed body on a fixed root, alone in its world, whose links touch n
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -220,16 +220,8 @@ class _Data:
 
     def residuals(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
         """Return residuals (E, T, J) in sigmas and their derivatives (E, T, J, P + 3 + S); see `minimise`."""
-        point, every = torch.cat((shared.expand(len(states), -1), states), 1), torch.arange(len(states))
-        if not with_jacobian:
-            return self._residuals(point, every), None
-        sizes = [STEPS[0]] * len(self.parameters) + [STEPS[1]] * (point.shape[1] - len(self.parameters))
-        steps = torch.tensor(sizes).to(point)
-        moves = torch.cat((0 * steps[None], torch.diag(steps), -torch.diag(steps)))
-        moved = (point[None] + moves[:, None]).flatten(0, 1)
-        found = self._residuals(moved, every.repeat(len(moves))).unflatten(0, (len(moves), -1))
-        ahead, behind = found[1:].chunk(2)
-        return found[0], ((ahead - behind) / (2 * steps[:, None, None, None])).movedim(0, -1)
+        point = torch.cat((shared.expand(len(states), -1), states), 1)
+        return by_differences(self._residuals, point, len(self.parameters), with_jacobian)
 
     def _residuals(self, point: Tensor, episode: Tensor) -> Tensor:
         count, joints = len(self.parameters), self.tracks.values.shape[2]
@@ -253,6 +245,28 @@ class _Data:
     def size(self) -> int:
         """Number of coordinates of an episode."""
         return (2 + self.part_std.shape[1]) * self.part_std.shape[2]
+
+
+def by_differences(
+    residuals: Callable[[Tensor, Tensor], Tensor], point: Tensor, count: int, with_jacobian: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Return residuals (E, T, J) and their derivatives (E, T, J, V) by central differences over `STEPS`, or None.
+
+    Args:
+        residuals: Returns residuals (N, T, J) at values (N, V) of the episodes or parts (N,).
+        point: The values (E, V).
+        count: Number of them that are parameters, those first; the others are of states.
+        with_jacobian: Whether the derivatives are wanted.
+    """
+    every = torch.arange(len(point))
+    if not with_jacobian:
+        return residuals(point, every), None
+    steps = torch.tensor([STEPS[0]] * count + [STEPS[1]] * (point.shape[1] - count)).to(point)
+    moves = torch.cat((0 * steps[None], torch.diag(steps), -torch.diag(steps)))
+    moved = (point[None] + moves[:, None]).flatten(0, 1)
+    found = residuals(moved, every.repeat(len(moves))).unflatten(0, (len(moves), -1))
+    ahead, behind = found[1:].chunk(2)
+    return found[0], ((ahead - behind) / (2 * steps[:, None, None, None])).movedim(0, -1)
 
 
 def _pushed_link(world: World, seen: Observations, pushed: Sequence[_Pushed], name: str) -> int | None:

@@ -45,8 +45,8 @@ from .driven_joints import (
     ITERATIONS,
     MOST_FRAMES,
     ROBUST_SCALE,
-    STEPS,
     TOLERANCE,
+    by_differences,
     information_root,
     starts,
     takes,
@@ -203,16 +203,8 @@ class _Parts:
 
     def residuals(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
         """Return residuals (E, T, J) in sigmas and their derivatives (E, T, J, P + 2 J); see `minimise`."""
-        point, every = torch.cat((shared.expand(len(states), -1), states), 1), torch.arange(len(states))
-        if not with_jacobian:
-            return self._residuals(point, every), None
-        count = len(self.parameters)
-        steps = torch.tensor([STEPS[0]] * count + [STEPS[1]] * (point.shape[1] - count)).to(point)
-        moves = torch.cat((0 * steps[None], torch.diag(steps), -torch.diag(steps)))
-        moved = (point[None] + moves[:, None]).flatten(0, 1)
-        found = self._residuals(moved, every.repeat(len(moves))).unflatten(0, (len(moves), -1))
-        ahead, behind = found[1:].chunk(2)
-        return found[0], ((ahead - behind) / (2 * steps[:, None, None, None])).movedim(0, -1)
+        point = torch.cat((shared.expand(len(states), -1), states), 1)
+        return by_differences(self._residuals, point, len(self.parameters), with_jacobian)
 
     def _residuals(self, point: Tensor, part: Tensor) -> Tensor:
         count, joints = len(self.parameters), self.tracks.values.shape[2]
