@@ -119,7 +119,7 @@ def _fastest(
     known: Mapping[str, dict[str, Track]] | None,
 ) -> list[_Frame]:
     """Return the frames of a camera in which a body moves fastest, those first."""
-    found: list[tuple[float, _Frame]] = []
+    found: list[tuple[float, Camera, Image, float, tuple[Track, ...]]] = []
     for episode in capture.episodes(split)[:EPISODES]:
         tracks = capture.tracks(episode) if known is None else known.get(episode, {})
         moved = [_track(model, body, tracks) for body in range(len(model.file.bodies))]
@@ -134,11 +134,15 @@ def _fastest(
             ends = [_poses(track, times[k] + interval_s * np.array([-0.5, 0.5]))[0][:, 0] for track in motions]
             moved_px = max(float(np.linalg.norm(np.diff(view.project(end)[0], axis=0))) for end in ends)
             if moved_px >= LEAST_PX:
-                image, plain = view.undistorted(frames[k])
-                valid = view.undistorted(np.full(image.shape[:2], 255, np.uint8))[0] == 255
-                frame = _Frame(image=image, valid=valid, camera=plain, time_s=float(times[k]), tracks=motions)
-                found.append((moved_px, frame))
-    return [frame for _, frame in sorted(found, key=lambda one: -one[0])[:FRAMES]]
+                found.append((moved_px, view, frames[k].copy(), float(times[k]), motions))
+    return [_undistorted(*one[1:]) for one in sorted(found, key=lambda one: -one[0])[:FRAMES]]
+
+
+def _undistorted(view: Camera, picture: Image, time_s: float, tracks: tuple[Track, ...]) -> _Frame:
+    """Return a frame of a video without the distortion of its lens."""
+    image, plain = view.undistorted(picture)
+    valid = view.undistorted(np.full(image.shape[:2], 255, np.uint8))[0] == 255
+    return _Frame(image=image, valid=valid, camera=plain, time_s=time_s, tracks=tracks)
 
 
 def _track(model: Model, index: int, tracks: Mapping[str, Track]) -> Track | None:
