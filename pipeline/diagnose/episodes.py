@@ -29,6 +29,8 @@ class DiagnosedEpisodes:
     """Standard deviation of position [m] and rotation [rad]; None where it is unknown."""
     warnings: tuple[str, ...]
     """Warnings for the report."""
+    filmed: bool = False
+    """Whether the tracks are those that the model's fit found in videos."""
 
 
 def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedEpisodes:
@@ -44,11 +46,11 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
     free = {body.name for body in model.file.bodies if body.motion == "free"}
     known = (capture.manifest.measurement.position_std_m, capture.manifest.measurement.rotation_std_rad)
     warnings: tuple[str, ...] = ()
-    names = capture.episodes(split)
+    filmed, names = False, capture.episodes(split)
     if any(free & set(capture.tracks(name)) for name in names) or not any(capture.videos(name) for name in names):
         found, warnings = with_regular_times(track_episodes(capture, split), free)
     else:
-        found, known = _filmed(model, capture, split), _filmed_noise(model, names)
+        filmed, found, known = True, _filmed(model, capture, split), _filmed_noise(model, names)
         warnings = (
             f"the tracks are those that the fit found in the videos ({POSE_TRACKS}/ of the model): errors of "
             "neighbouring frames are correlated, and a systematic error, as of a wrong shape, can look like physics.",
@@ -62,7 +64,7 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
             "record more, or name another split with --split.",
         )
     chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
-    return DiagnosedEpisodes(tuple(episodes[k] for k in chosen), known, warnings)
+    return DiagnosedEpisodes(tuple(episodes[k] for k in chosen), known, warnings, filmed)
 
 
 def _filmed(model: Model, capture: Capture, split: str) -> list[Episode]:

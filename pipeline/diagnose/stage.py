@@ -182,7 +182,11 @@ def prepared_world(
             kept = [episode for episode in found.episodes if episode[0] not in unlike]
             prepared = prepare(world, kept, found.noise, _groups(capture, [name for name, _ in kept]))
     changed = changed_since_fit(model.file.provenance, capture)
-    prepared = replace(prepared, warnings=(*changed, *found.warnings, *unlike_warnings(unlike), *prepared.warnings))
+    prepared = replace(
+        prepared,
+        filmed=found.filmed,
+        warnings=(*changed, *found.warnings, *unlike_warnings(unlike), *prepared.warnings),
+    )
     check_observability(world, prepared, str(capture.root))
     return world, prepared
 
@@ -337,7 +341,7 @@ def _whole(world: World, found: DiagnosedEpisodes, place: str) -> tuple[World, D
             f"flights in at least {least} episodes; in contact, jointed bodies are not examined.",
             "record throws, or use 'cgwm compare', which shows in which phase and at which link predictions miss.",
         )
-    return alone, DiagnosedEpisodes(flown, (None, None), (*found.warnings, JOINTED.format(name=name)))
+    return alone, DiagnosedEpisodes(flown, (None, None), (*found.warnings, JOINTED.format(name=name)), found.filmed)
 
 
 def _groups(capture: Capture, names: Sequence[str]) -> list[int]:

@@ -71,6 +71,9 @@ class Prepared:
     """Times [s] of the frames of flight that are left out as wrong measurements, by name of the episode."""
     time_error_s: float = 0.0
     """Standard deviation of errors of the frames' times [s]; 0 where flights show none."""
+    filmed: bool = False
+    """Whether the tracks were found in videos: their errors vary slowly, also where no flight is long enough to show
+    that."""
 
     @property
     def least_force_m_s2(self) -> float:

@@ -63,13 +63,16 @@ class ResolvedFlight:
 def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[SelectionStep]) -> ResolvedFlight:
     """Fit the contact segments and keep the flight equals that they admit; all of them without contact.
 
+    Where the poses were found in videos, contact is not asked either: it tells equals of flight apart by tenths of a
+    millimetre within some frames, over which the errors of such poses are alike, while chi2 counts each frame.
+
     Args:
         prepared: The episodes.
         after_flight: The world with the effects selected in flight.
         steps: Selection steps of the flight search.
     """
     flagged, after_flight = _undoubled([step for step in steps if step.flagged], after_flight)
-    ambiguous = [step for step in flagged if _is_asked(step, flagged)]
+    ambiguous = [] if prepared.filmed else [step for step in flagged if _is_asked(step, flagged)]
     neutral = without_effects(after_flight, *(step.best.name for step in ambiguous))
     fitted = fitted_contact(prepared, neutral)
     if fitted is None:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.diagnose import diagnose, stage
+from cgwm.pipeline.diagnose.contact import flight_equals
 from cgwm.pipeline.diagnose.contact.flight_equals import fitted_contact, resolved_flight, separated
 from cgwm.pipeline.diagnose.evidence import falsification
 from cgwm.pipeline.diagnose.evidence.effect_selection import SelectionStep, are_slight, repeats, select_next
@@ -253,6 +254,21 @@ def test_contact_is_not_asked_which_drag_it_is_that_the_wind_acts_through() -> N
     assert [e.name for e in found.chosen[0]] == ["quadratic_drag", "linear_drag"]
     assert found.segments is not None
     assert {a.effect.name for a in found.after_flight.effects} == {"quadratic_drag", found.chosen[1][0].name}
+
+
+def test_contact_is_asked_of_measured_tracks_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The errors of poses found in videos are alike over the few frames by which contacts tell drags apart."""
+    prepared, world = ready("ball", {}, 3, count=2, duration_s=0.3, height_m=(0.1, 0.25))
+    equals = tuple(SimpleNamespace(name=name, refitted=None) for name in ("quadratic_drag", "linear_drag"))
+    contact = SimpleNamespace(world=world), None
+    monkeypatch.setattr(flight_equals, "_is_asked", lambda *_: True)
+    monkeypatch.setattr(flight_equals, "fitted_contact", lambda *_: contact)
+    monkeypatch.setattr(flight_equals, "refitted_contact", lambda *_: contact)
+    monkeypatch.setattr(flight_equals, "separated", lambda both, *_: (list(both[1:]), {}))
+    step = SelectionStep((), equals, True)  # pyright: ignore[reportArgumentType]
+    for filmed, kept in ((False, ["linear_drag"]), (True, ["quadratic_drag", "linear_drag"])):
+        found = resolved_flight(replace(prepared, filmed=filmed), world, [step])
+        assert [e.name for e in found.chosen[0]] == kept
 
 
 def test_neither_order_nor_names_of_candidates_matter() -> None:
