@@ -227,7 +227,7 @@ def _with_appearance(model: Model, capture: Capture, split: str, config: PhysCon
     exposures = estimate_exposures(model, capture, split, config.device)
     model = replace(model, file=model.file.model_copy(update={"exposures": exposures}))
     tracks = found.tracks if config.supervise == "images" else None  # measured ones are not used then
-    model = learn_appearance(model, capture, exposures, split, tracks)
+    model = learn_appearance(model, capture, exposures, split, tracks, config.device)
     return with_durations(model, capture, split, tracks, config.device)
 
 

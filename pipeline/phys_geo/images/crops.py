@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -27,10 +28,15 @@ class Window:
 
     def cut(self, pictures: Tensor, which: Tensor | None = None) -> Tensor:
         """Return the rectangles (S, h, w, F) of images (T, H, W, F); `which`: images instead of the window's frames."""
+        frames = self.frames if which is None else which
+        return pictures[frames[:, None, None], *self._pixels]
+
+    @cached_property
+    def _pixels(self) -> tuple[Tensor, Tensor]:
+        """Rows (S, h, 1) and columns (S, 1, w)."""
         columns = self.corners[:, :1] + torch.arange(self.size[0], device=self.corners.device)
         rows = self.corners[:, 1:] + torch.arange(self.size[1], device=self.corners.device)
-        frames = self.frames if which is None else which
-        return pictures[frames[:, None, None], rows[:, :, None], columns[:, None, :]]
+        return rows[:, :, None], columns[:, None, :]
 
     def repeat(self, times: int) -> Window:
         """Return the windows repeated the given number of times."""
@@ -62,7 +68,7 @@ def window_of(video: Video, frames: Tensor, means: Tensor, reach: Tensor, margin
         low = (low - margin).clamp_min(0).minimum(extent)
         high = (high + margin).clamp_min(0).minimum(extent)
         low = (low / _TILE).floor() * _TILE
-        span = (high - low).clamp_min(1).amax(0)
-        size = [min(int(extent[k]), math.ceil(float(span[k]) / _TILE) * _TILE) for k in (0, 1)]
+        span = (high - low).clamp_min(1).amax(0).tolist()  # one wait for the device
+        size = [min(video.size[k], math.ceil(span[k] / _TILE) * _TILE) for k in (0, 1)]
         corners = low.minimum(extent - extent.new_tensor(size)).clamp_min(0).to(torch.int64)
         return Window(frames, corners, (size[0], size[1]))

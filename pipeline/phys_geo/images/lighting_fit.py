@@ -29,6 +29,7 @@ from ...physics.kinematic import Drive
 from ...rendering.relighting import Relighting, light_terms
 from ...rendering.render import RenderOutput, render
 from ...rendering.video_view import usable_cameras, video_view
+from ...runtime.device import resolve_device
 from ...sg_gs.colors import sphere_weights
 from ...sg_gs.views import load_views
 
@@ -88,6 +89,7 @@ def learn_appearance(
     exposures: dict[str, Exposure],
     split: str = "train",
     found: Mapping[str, dict[str, Track]] | None = None,
+    device: str = "auto",
 ) -> Model:
     """Add the light to a model, and the colours of spheres that only the motion shows.
 
@@ -97,13 +99,15 @@ def learn_appearance(
         exposures: Exposure by video camera; other cameras are not used.
         split: Name of the episodes.
         found: Tracks found in the videos, by episode and body, instead of measured ones; None for measured ones.
+        device: Device of the renderer: auto, cpu or cuda.
 
     Returns:
         The model, unchanged if too little of a moving body is seen.
     """
-    frames = _frames(model, capture, exposures, split, found)
-    seen = {name: _seen(model, capture, name) for name in {model.file.bodies[frame.body].name for frame in frames}}
-    rows = [row for frame in frames if (row := _ratios(model, frame, seen)) is not None]
+    frames, drawn_on = _frames(model, capture, exposures, split, found), resolve_device(device)
+    moving = {model.file.bodies[frame.body].name for frame in frames}
+    seen = {name: _seen(model, capture, name, drawn_on) for name in moving}
+    rows = [row for frame in frames if (row := _ratios(model, frame, seen, drawn_on)) is not None]
     sides = [side for row in rows for side in _sides(*row)]
     if sum(len(ratio) for ratio, _, _ in rows) < MIN_BLOCKS or not sides:
         return model
@@ -113,7 +117,7 @@ def learn_appearance(
     for index, body in enumerate(model.file.bodies):
         mine = [frame for frame in frames if frame.body == index]
         if mine:
-            splats[body.name] = _colored(model, index, mine, light, seen[body.name])
+            splats[body.name] = _colored(model, index, mine, light, seen[body.name], drawn_on)
             # where the visual spheres collide, they stay one set
             if model.collision.get(body.name) is model.body_splats[body.name]:
                 collision[body.name] = splats[body.name]
@@ -229,14 +233,14 @@ def _body_frames(
     return found
 
 
-def _seen(model: Model, capture: Capture, name: str) -> NDArray[np.bool_]:
+def _seen(model: Model, capture: Capture, name: str, device: torch.device) -> NDArray[np.bool_]:
     """Return which spheres (N,) of a body the photos show."""
     splats = model.body_splats[name]
     if capture.cameras is None:
         return np.ones(len(splats), bool)
     posed = [photo for photo in capture.photos() if photo in capture.cameras.images]
     picked = np.unique(np.linspace(0, len(posed) - 1, PHOTOS).round().astype(int)) if posed else []
-    views = load_views(capture, [posed[k] for k in picked], PHOTO_SIZE, torch.device("cpu"))
+    views = load_views(capture, [posed[k] for k in picked], PHOTO_SIZE, device)
     parts = []
     for body in [
         next(b for b in model.file.bodies if b.name == name),
@@ -246,15 +250,16 @@ def _seen(model: Model, capture: Capture, name: str) -> NDArray[np.bool_]:
             T_world_body = torch.eye(4)
             T_world_body[:3, :3] = quat_to_matrix(torch.tensor(body.photo_pose.quat_wxyz))
             T_world_body[:3, 3] = torch.tensor(body.photo_pose.position_m)
-            parts.append(Spheres.from_numpy(model.body_splats[body.name]).moved(T_world_body))
+            spheres = Spheres.from_numpy(model.body_splats[body.name], device=device)
+            parts.append(spheres.moved(T_world_body.to(device)))
     if model.scene is not None:
-        parts.append(Spheres.from_numpy(model.scene))
+        parts.append(Spheres.from_numpy(model.scene, device=device))
     spheres, normals = Spheres.joined(parts), _resting_normals(model, name)
-    weight = torch.zeros(len(splats))
+    weight = torch.zeros(len(splats), device=device)
     for view in views:
         facing = _facing(parts[0].means, normals, torch.as_tensor(view.camera.center))
         weight += sphere_weights(spheres, view)[: len(splats)] * facing
-    return (weight >= SEEN_PX).numpy()
+    return (weight >= SEEN_PX).cpu().numpy()
 
 
 def _resting_normals(model: Model, name: str) -> Tensor:
@@ -271,12 +276,15 @@ def _facing(means: Tensor, normals: Tensor, eye: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _ratios(model: Model, frame: _Frame, seen: dict[str, NDArray[np.bool_]]) -> tuple[Array, Array, Array] | None:
+def _ratios(
+    model: Model, frame: _Frame, seen: dict[str, NDArray[np.bool_]], device: torch.device
+) -> tuple[Array, Array, Array] | None:
     """Return brightness ratios (n,), and normals in frame and photos (n, 3), of blocks on a body that photos show."""
     body = model.file.bodies[frame.body]
     splats = model.body_splats[body.name]
     known = seen[body.name].astype(np.float64)[:, None]
-    features, alpha = _pictured(splats, frame, np.concatenate([splats.colors, frame.normals, known], 1).astype(float))
+    shown = np.concatenate([splats.colors, frame.normals, known], 1).astype(float)
+    features, alpha = _pictured(splats, frame, shown, device)
     brightness = [frame.image.sum(-1)[..., None], features[..., :3].sum(-1)[..., None]]
     blocks = _blocks(np.concatenate([*brightness, features[..., 3:]], -1), frame.usable & (alpha > MIN_ALPHA))
     length = np.linalg.norm(blocks[:, 2:5], axis=1)
@@ -305,28 +313,35 @@ def _sides(ratio: Array, now: Array, photo: Array) -> list[tuple[Array, Array, A
     return found
 
 
-def _pictured(splats: Splats, frame: _Frame, features: Array) -> tuple[Array, Array]:
+def _pictured(splats: Splats, frame: _Frame, features: Array, device: torch.device) -> tuple[Array, Array]:
     """Return features (H, W, F) and alpha (H, W) of a body alone in a frame."""
-    spheres = _in_frame(splats, frame, torch.as_tensor(features, dtype=torch.float32))
+    spheres = _in_frame(splats, frame, torch.as_tensor(features, dtype=torch.float32, device=device))
     picture = _rendered(spheres, frame.camera)
-    return picture.features[0].double().numpy(), picture.alpha[0].numpy()
+    return picture.features[0].double().cpu().numpy(), picture.alpha[0].cpu().numpy()
 
 
 def _in_frame(splats: Splats, frame: _Frame, features: Tensor) -> Spheres:
-    """Return a body's spheres at its pose in a frame, with features (N, F) as colours."""
-    spheres = Spheres.from_numpy(splats)
-    means = spheres.means @ frame.rotation.float().T + frame.position.float()
+    """Return a body's spheres at its pose in a frame, with features (N, F) as colours, on the device of these."""
+    spheres = Spheres.from_numpy(splats, device=features.device)
+    means = spheres.means @ frame.rotation.to(features).T + frame.position.to(features)
     return Spheres(means, spheres.scales, spheres.opacities, features)
 
 
 def _rendered(spheres: Spheres, camera: Camera) -> RenderOutput:
     """Return the render of spheres in a camera."""
-    viewmat, K = (torch.as_tensor(a, dtype=torch.float32)[None] for a in (camera.T_cam_world, camera.K))
+    viewmat, K = (torch.as_tensor(a).to(spheres.means)[None] for a in (camera.T_cam_world, camera.K))
     size = (camera.width, camera.height)
     return render(spheres.means, spheres.scales, spheres.opacities, spheres.colors, viewmat, K, *size)
 
 
-def _colored(model: Model, index: int, frames: Sequence[_Frame], light: Light, seen: NDArray[np.bool_]) -> Splats:
+def _colored(
+    model: Model,
+    index: int,
+    frames: Sequence[_Frame],
+    light: Light,
+    seen: NDArray[np.bool_],
+    device: torch.device,
+) -> Splats:
     """Return a body's spheres with colours from the frames for those that no photo shows, in the light of the photos.
 
     Spheres that neither shows get the median colour of the seen ones, with the brightness of their side.
@@ -338,14 +353,14 @@ def _colored(model: Model, index: int, frames: Sequence[_Frame], light: Light, s
     relighting = Relighting.of(light, body, torch.as_tensor(splats.normals, dtype=torch.float64))
     total = torch.zeros(len(splats), 4, dtype=torch.float64)
     for frame in frames:
-        features = torch.zeros(len(splats), 4, requires_grad=True)
+        features = torch.zeros(len(splats), 4, device=device, requires_grad=True)
         spheres = _in_frame(splats, frame, features)
         picture = _rendered(spheres, frame.camera).features[0]
-        usable = torch.as_tensor(frame.usable, dtype=torch.float32)[..., None]
-        real = torch.cat([torch.as_tensor(frame.image, dtype=torch.float32), torch.ones_like(usable)], -1)
-        sums = torch.autograd.grad((picture * real * usable).sum(), features)[0].double()
+        usable = torch.as_tensor(frame.usable).to(picture)[..., None]
+        real = torch.cat([torch.as_tensor(frame.image).to(picture), torch.ones_like(usable)], -1)
+        sums = torch.autograd.grad((picture * real * usable).sum(), features)[0].double().cpu()
         eye = torch.as_tensor(frame.camera.center)
-        sums *= _facing(spheres.means, relighting.normals @ frame.rotation.T, eye)[:, None]
+        sums *= _facing(spheres.means.cpu(), relighting.normals @ frame.rotation.T, eye)[:, None]
         turn = relighting.turned(frame.rotation)
         total += torch.cat([sums[:, :3] / turn[:, None], sums[:, 3:]], 1)
     in_photos = relighting.in_photos.numpy()

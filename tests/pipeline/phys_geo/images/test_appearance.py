@@ -26,6 +26,7 @@ from cgwm.pipeline.rendering.relighting import Relighting
 from cgwm.schemas import Light
 from helpers.small_model import small_model
 
+CPU = torch.device("cpu")
 LIGHT = Light(lamp=(0.3, -0.4, 0.7), sky=0.15)
 
 
@@ -139,7 +140,7 @@ def _ball_filmed(light: Light) -> tuple[Model, Splats, list[_Frame]]:
 
 def test_light_is_found_from_frames_of_a_turning_ball() -> None:
     model, ball, frames = _ball_filmed(LIGHT)
-    rows = [_ratios(model, frame, {"cube": np.ones(len(ball), bool)}) for frame in frames]
+    rows = [_ratios(model, frame, {"cube": np.ones(len(ball), bool)}, CPU) for frame in frames]
     ratio, now, photo = (np.concatenate([row[k] for row in rows if row is not None]) for k in range(3))
     found = fit_light(ratio, now, photo, 3 * len(rows))
     directions = torch.as_tensor(_directions(500, 10))
@@ -152,10 +153,10 @@ def test_sides_that_no_photo_shows_get_their_colours_from_the_frames() -> None:
     seen = ball.normals[:, 2] > -0.5
     hidden = replace(ball, colors=np.where(seen[:, None], ball.colors, 0.9))
     model = replace(model, body_splats={"cube": hidden})
-    found = _colored(model, 0, frames, LIGHT, seen)
+    found = _colored(model, 0, frames, LIGHT, seen, CPU)
     np.testing.assert_array_equal(found.colors[seen], hidden.colors[seen])
     error = np.abs(found.colors - ball.colors)[~seen]
     assert np.median(error) < 0.03
     # without frames, the mean of what is seen stands in, as bright as that side would be
-    blind = _colored(model, 0, [], LIGHT, seen)
+    blind = _colored(model, 0, [], LIGHT, seen, CPU)
     assert np.median(np.abs(blind.colors - ball.colors)[~seen]) < 0.12
