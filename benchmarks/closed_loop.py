@@ -24,7 +24,7 @@ from cgwm.datasets.capture.cameras import Camera
 from cgwm.datasets.models.model import Model
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.pipeline.control.closed_loop import ClosedLoop, Command, Velocity
-from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.physics.state import State
 from cgwm.schemas import BodyModel, ContactParameters, Ground, ModelFile, Pose, Provenance, Solver
 
 PUBLISHED_HZ = 40.0

@@ -33,7 +33,7 @@ from cgwm.pipeline.fit import fit
 from cgwm.pipeline.phys_geo.tracks.contact_fit import fit_physics
 from cgwm.pipeline.physics import Body, ContactLaw, World
 from cgwm.pipeline.physics.rollout import simulate
-from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.runtime.device import resolve_device
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import FittedParameter, PhysConfig, SplatConfig

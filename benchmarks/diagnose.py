@@ -41,7 +41,7 @@ from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.evaluate.evaluation import Evaluation
 from cgwm.pipeline.evaluate.stage import evaluate_model
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics import world_of_model
 from cgwm.pipeline.physics.effects.registry import FLIGHT_ALIASES
 from cgwm.pipeline.trajectories.initial_state import flight_frames
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
@@ -231,7 +231,7 @@ def errors_of_test(model: Model, capture: Capture, ends_s: dict[str, float]) -> 
 
 def first_contacts(base: Path, capture: Capture) -> dict[str, float]:
     """Return the time of the first contact of each test episode [s], by the shape that a model has."""
-    world = World.from_model(read_model(base))
+    world = world_of_model(read_model(base))
     whole = whole_episodes(world, [Episode(name, capture.tracks(name)) for name in capture.episodes("test")])
     ends = flight_frames(world, whole).sum(1).clamp(max=whole.times_s.shape[1] - 1)
     return {name: float(times[end]) for name, times, end in zip(whole.names, whole.times_s, ends, strict=True)}

@@ -35,8 +35,10 @@ from cgwm.datasets.models.model import Model
 from cgwm.pipeline.physics.chains.parameters import chain_parameters
 from cgwm.pipeline.physics.chains.state import joints_of, with_joints
 from cgwm.pipeline.physics.engine import rollout
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.physics.parameters import GROUND_SHIFT, Parameter
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -90,7 +92,7 @@ def hinge(world: World, position: torch.Tensor, quat: torch.Tensor) -> Array:
 
 def tosses_of(model: Model, capture: Capture, names: Sequence[str], noise: Noise) -> Tosses:
     """Return tosses with states that the world of the URDF fits to their first 0.1 s."""
-    world = World.from_model(model)
+    world = world_of_model(model)
     episodes = [Episode(name, capture.tracks(name)) for name in names]
     spans = [(-1.0, 10.0)] * len(episodes)
     seen = Observations.of(world, episodes, spans)
@@ -298,7 +300,7 @@ def run(source: Path, work: Path, held_out: bool, seed: int, workers: int) -> di
     rival = Rival(capture, fitted.world)
     print(f"cgwm fit: {cpu_s:.0f} s of CPU; CEM of MuJoCo:")
     coordinates, rival_s = fitted_by_cem(rival, fitted, cpu_s, seed, workers)
-    world = World.from_model(model)
+    world = world_of_model(model)
     sets = {"fitted": fitted, "left out": tosses_of(plain, capture, left, noise)}
     if held_out:
         sets["held out"] = tosses_of(plain, capture, capture.episodes("test"), noise)

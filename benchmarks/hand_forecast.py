@@ -33,7 +33,7 @@ from cgwm.pipeline.geometry.rotation import quat_turn
 from cgwm.pipeline.physics.chains.joint_command import JointCommand
 from cgwm.pipeline.physics.chains.state import joints_of
 from cgwm.pipeline.physics.engine import rollout
-from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.sg_gs import link_hulls
 from cgwm.schemas import HandTask
 

@@ -25,8 +25,9 @@ from cgwm.datasets.models.mjcf import APART, APART_ITERATIONS, write_mjcf
 from cgwm.datasets.models.model import Model, read_model
 from cgwm.datasets.shapes.ply import Splats
 from cgwm.pipeline.export.mujoco_check import AFTER_CONTACT_S, FRAME_S, start_of
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.physics.rollout import simulate
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.synthesize.start_states import Start
 from cgwm.schemas import BodyModel, ContactParameters, Ground, ModelFile, Pose, Provenance, Solver
 
@@ -94,7 +95,7 @@ def case_of(model: Model, seeds: range) -> Case:
     parts = ("position_m", "quat_wxyz", "velocity_m_s", "omega_body_rad_s")
     state = State(*(torch.as_tensor(np.stack([getattr(s, part) for s in starts])).double() for part in parts))
     with torch.no_grad():
-        world = World.from_model(model, torch.float64)
+        world = world_of_model(model, torch.float64)
         ours = simulate(world, state, torch.as_tensor(times), starts[0].driven, record_contacts=True)
     assert ours.contacts is not None  # asked for above
     touching = (ours.contacts.impulse_n_s.numpy() != 0).any((2, 3))

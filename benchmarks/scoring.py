@@ -19,7 +19,7 @@ from cgwm.pipeline.evaluate.frame_strips import strips_of
 from cgwm.pipeline.evaluate.image_errors import VideoErrors
 from cgwm.pipeline.evaluate.prediction import MODEL, EpisodePrediction, Motion
 from cgwm.pipeline.phys_geo.images.video_exposure import estimate_exposures
-from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.rendering.contact_sheets import FrameStrip
 from cgwm.pipeline.rendering.video_view import usable_cameras
 from cgwm.schemas import InputDataError, NotConvergedError

@@ -26,8 +26,10 @@ from typing import Any
 import numpy as np
 import torch
 from cgwm.pipeline.demo.truth_tables import OBJECT
+from cgwm.pipeline.physics.body import Body
 from cgwm.pipeline.physics.contact_law import ContactLaw
-from cgwm.pipeline.physics.world import Body, World
+from cgwm.pipeline.physics.model_world import world_of_model
+from cgwm.pipeline.physics.world import World
 from cgwm.schemas import CgwmError, NotConvergedError
 from cgwm.schemas.materials import of_pair
 from contenders.cgwm_default import Cgwm
@@ -67,7 +69,7 @@ def measure(job: Job, work: Work, damping: Sequence[float] = ()) -> dict[str, An
         fitted, judge = Cgwm().fit(cell, None), Judge.of(cell, 0)
     except CgwmError as error:
         return vars(job) | {"failed": error.found}
-    learned, true = World.from_model(fitted.model), Floor().fit(cell, None).world
+    learned, true = world_of_model(fitted.model), Floor().fit(cell, None).world
     worlds = {"fitted": learned, **{part: mixed(learned, true, (part,)) for part in PARTS}, "floor": true}
     worlds["as the tracks have it"] = with_numbers(learned, true, fitted.record["parameters_from_tracks"])
     worlds |= {f"damping ratio {ratio:g}": damped(learned, true, ratio) for ratio in damping if true.pair_laws}

@@ -24,7 +24,7 @@ from cgwm.datasets.importers.contactnets import HALF_WIDTH_M, INERTIA_KG_M2, RAT
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.evaluate import evaluate
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.schemas import PhysConfig
 from mujoco_cube import NUMBERS, Rival, Tosses, cross_entropy, decoded
 from numpy.typing import NDArray
@@ -97,7 +97,7 @@ class Benchmark:
         }
 
     def _rival(self, mass_distribution: bool, split: str) -> tuple[list[str], Rival]:
-        world = World.from_model(read_model(self.model(True)))
+        world = world_of_model(read_model(self.model(True)))
         if not mass_distribution:  # the states are estimated in flight, where the contact does not matter
             inertia = INERTIA_KG_M2 * torch.eye(3).to(world.gravity)[None]
             world = world.with_body(0, com=torch.zeros(1, 3).to(world.gravity), inertia=inertia)
@@ -117,7 +117,7 @@ class Benchmark:
 
     def account(self) -> dict[str, Any]:
         """Say what the engine's error on the test tosses is made of."""
-        world = World.from_model(read_model(self.model(True)))
+        world = world_of_model(read_model(self.model(True)))
         return Account.of(world, Capture.open(self.capture()), "test", ACCOUNT_TOSSES).report(SEED)
 
 

@@ -43,7 +43,7 @@ from .phys_geo.material_pairs import require_known_pairs
 from .phys_geo.stage import fit_motion
 from .phys_geo.tracks.earlier_estimates import with_fitted_physics
 from .physics.effects.trust import is_trusted, keep_trust
-from .physics.world import inertia_elements, symmetric
+from .physics.inertia import inertia_elements, symmetric
 from .runtime.checkpoint import Checkpoint
 from .runtime.device import resolve_device
 from .runtime.resources import enough_memory

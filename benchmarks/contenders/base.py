@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.physics.state import State
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.synthetic.objects import SolidObject
 from cgwm.pipeline.demo.truth_tables import OBJECT
-from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.trajectories.residuals import retract
 from cgwm.schemas import NotConvergedError
 

@@ -12,7 +12,8 @@ from typing import Any
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import Model, read_model
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.model_world import world_of_model
+from cgwm.pipeline.physics.state import State
 from cgwm.schemas import PhysConfig, UsageError
 
 from .base import Array, Cell, Prediction
@@ -76,4 +77,4 @@ class FittedCgwm:
 
     def predict(self, start: State, drives: Mapping[str, Track], times_s: Array) -> Prediction:
         """Predict open loop with the fitted world."""
-        return rolled_out(World.from_model(self.model), start, drives, times_s)
+        return rolled_out(world_of_model(self.model), start, drives, times_s)

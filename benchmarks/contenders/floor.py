@@ -17,7 +17,10 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
 from cgwm.datasets.synthetic import read_truth
 from cgwm.pipeline.demo.truth_tables import OBJECT
-from cgwm.pipeline.physics.world import State, World, symmetric
+from cgwm.pipeline.physics.inertia import symmetric
+from cgwm.pipeline.physics.model_world import world_of_model
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from cgwm.schemas import ContactParameters
 from tabletop.true_world import Numbers, on_true_ground, spheres_in, true_body
 
@@ -36,7 +39,7 @@ class Floor:
         started = time.perf_counter()
         truth, model = read_truth(cell.capture), read_model(cell.splats)
         file = model.file.model_copy(update={"contact": ContactParameters()})
-        world = World.from_model(replace(model, file=file))
+        world = world_of_model(replace(model, file=file))
         true, contact = truth.object, truth.contact
         spheres = spheres_in(cell.capture, true.mesh)
         index = world.body_names.index(OBJECT)

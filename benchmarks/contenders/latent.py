@@ -29,7 +29,8 @@ from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack
 from cgwm.pipeline.phys_geo.images.video_episodes import kinematic_poses
 from cgwm.pipeline.phys_geo.images.video_exposure import estimate_exposures
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.rendering.render import render
 from cgwm.schemas import Exposure, UsageError
 from numpy.typing import NDArray

@@ -13,7 +13,8 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.synthetic.objects import SolidObject
 from cgwm.pipeline.geometry.rotation import quat_conjugate, quat_rotate
 from cgwm.pipeline.physics.kinematic import Drive
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 
 from .base import Array
 

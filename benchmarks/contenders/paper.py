@@ -27,7 +27,8 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics.paper_law import CLAMP_ZERO, PaperLaw
 from cgwm.pipeline.physics.rollout import simulate
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from cgwm.schemas import InputDataError, NotConvergedError
 from torch import Tensor
 

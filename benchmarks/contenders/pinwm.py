@@ -19,7 +19,8 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.phys_geo.images.end_to_end import ImageObjective
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from cgwm.schemas import NotConvergedError
 from torch import Tensor
 

@@ -19,8 +19,10 @@ from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack, PoseTracker, pose_noise
 from cgwm.pipeline.phys_geo.images.video_episodes import COARSE_SIZE, commands, kinematic_poses
 from cgwm.pipeline.phys_geo.images.video_frames import Footage, load_footage
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.physics.observation_model import measure
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.trajectories.initial_state import estimate_states, flight_frames, warmup_frames
 from cgwm.pipeline.trajectories.observations import START_FRAMES, Observations, first_state
 from cgwm.schemas import ContactParameters, NotConvergedError, PhysConfig
@@ -85,7 +87,7 @@ def open_training(cell: Cell) -> Training:
     model = read_model(cell.splats)
     file = model.file.model_copy(update={"contact": ContactParameters()})
     model = replace(model, file=file)
-    world = World.from_model(model)
+    world = world_of_model(model)
     footage = load_footage(capture, TRAIN_EPISODE, PhysConfig().image_size, cell.device)
     drives = commands(world, capture, TRAIN_EPISODE, capture.tracks(TRAIN_EPISODE))
     position, quat = kinematic_poses(world, drives, footage.times_s)

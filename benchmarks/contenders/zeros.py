@@ -9,7 +9,9 @@ from typing import Any
 from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.phys_geo.images.video_episodes import kinematic_poses
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.model_world import world_of_model
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from cgwm.schemas import ContactParameters
 
 from .base import Array, Cell, Prediction
@@ -70,5 +72,5 @@ def _world(cell: Cell) -> World:
     """Return the model's world without a ground."""
     model = read_model(cell.splats)
     file = model.file.model_copy(update={"contact": ContactParameters()})
-    world = World.from_model(replace(model, file=file))
+    world = world_of_model(replace(model, file=file))
     return replace(world, ground_normal=None, ground_offset=None)

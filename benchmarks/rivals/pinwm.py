@@ -20,7 +20,8 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.demo.truth_tables import OBJECT
 from cgwm.pipeline.phys_geo.images.video_episodes import kinematic_poses
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.model_world import world_of_model
+from cgwm.pipeline.physics.state import State
 from cgwm.schemas import ContactParameters, NotConvergedError
 from contenders.base import Array, Cell, Prediction
 from contenders.training import checked
@@ -96,7 +97,7 @@ class FittedPinWmItself:
             NotConvergedError: If its simulator fails, or diverges.
         """
         model = read_model(self.splats)
-        world = World.from_model(replace(model, file=model.file.model_copy(update={"contact": ContactParameters()})))
+        world = world_of_model(replace(model, file=model.file.model_copy(update={"contact": ContactParameters()})))
         index = world.body_names.index(OBJECT)
         state = self.simulator.local.state(*(values[0, index].numpy() for values in vars(start).values()))
         try:

@@ -13,11 +13,13 @@ from cgwm.datasets.shapes.meshes import mass_properties, read_mesh
 from cgwm.datasets.synthetic.dynamics import FINGERTIP, FINGERTIP_RADIUS, GRAVITY, STEPS_PER_S, ContactTruth
 from cgwm.datasets.synthetic.objects import SolidObject
 from cgwm.datasets.synthetic.plan import EpisodePlan, ScenePlan
+from cgwm.pipeline.physics.body import Body
 from cgwm.pipeline.physics.contact_law import ContactLaw
 from cgwm.pipeline.physics.hull import Hull
 from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
-from cgwm.pipeline.physics.world import Body, State, World
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.sg_gs.collision_spheres import fills_hull, shape_to_spheres
 from cgwm.schemas import FileShape, Shape
 from cgwm.schemas.materials import pair_of

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from cgwm.pipeline.physics.body import Body
 from cgwm.pipeline.physics.effects import Effect, EffectParameter, Values
-from cgwm.pipeline.physics.world import Body, World
+from cgwm.pipeline.physics.world import World
 from torch import Tensor
 
 FACES = tuple((axis, side) for axis in range(3) for side in ("plus", "minus"))

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...schemas import PHASES, Phase
-from ..physics.world import State, World
+from ..physics.state import State
+from ..physics.world import World
 from ..segments.contact_phases import phases_of
 from ..segments.prepare import Prepared
 from ..segments.segment_states import fit_states

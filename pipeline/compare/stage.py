@@ -20,8 +20,9 @@ from ..evaluate.evaluation import Evaluation
 from ..evaluate.prediction import STATE_FIT_EPISODES
 from ..evaluate.stage import check_bodies, evaluate_model
 from ..evaluate.work import LESS, evaluation_parts
+from ..physics.model_world import world_of_model
 from ..physics.rollout_cost import durations, segment_part
-from ..physics.world import State, World
+from ..physics.state import State
 from ..report.page_file import links_beside, short_names, shows_the_same
 from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
@@ -125,7 +126,7 @@ def compare_models(
     shared = [name for name in names if all(any(e.errors.episode == name for e in ev.episodes) for ev in evaluations)]
     if not shared:
         raise InputDataError("no episode can be predicted by all models.", todo="run 'cgwm eval' with each model.")
-    first, given = World.from_model(models[0][1]), capture.manifest.measurement
+    first, given = world_of_model(models[0][1]), capture.manifest.measurement
     bodies = [first.bodies[k].name for k in first.tracked]
     episodes, clocked = episodes_at_clock(capture, shared, bodies)
     prepared = prepare(first, episodes, (given.position_std_m, given.rotation_std_rad))
@@ -178,7 +179,7 @@ def _with_short_predictions(
         flown = after_release(episodes, prepared.released_s)
         for _, model in models:
             # group-specific parameters come from the fit or from the same frames as the fitted states
-            world = World.from_model(model)
+            world = world_of_model(model)
             worlds.append(with_fitted_groups(world, flown, model.file, capture.groups, prepared.noise))
             contacts.append(contact_fit(worlds[-1], episodes, prepared, bodies, known))
             if contacts[-1] is not None:
@@ -210,7 +211,7 @@ def _checked_work(models: Sequence[tuple[str, Model]], capture: Capture, split: 
     spans, parts = durations(episodes), []
     for name, model in models:
         _check(name, model, capture)
-        world = World.from_model(model)
+        world = world_of_model(model)
         parts += evaluation_parts(world, episodes, STATE_FIT_EPISODES)
         parts.append(segment_part(f"short predictions of {name}", world, spans))
     with within_budget(parts, LESS, doubt=motion_doubt(spans)):
@@ -228,7 +229,7 @@ def _check(name: str, model: Model, capture: Capture) -> None:
     """Raise InputDataError with the model's name if its bodies or physics do not fit the capture."""
     try:
         check_bodies(model, capture.body_names, str(capture.root))
-        World.from_model(model)
+        world_of_model(model)
     except InputDataError as error:
         found = error.found if error.found.startswith(name) else f"{name}: {error.found}"
         raise InputDataError(found, error.allowed, error.todo) from None

@@ -26,8 +26,8 @@ from ..physics.chains.joint_command import JointCommand
 from ..physics.chains.state import joints_of
 from ..physics.checks import require_apart
 from ..physics.kinematic import Drive
+from ..physics.state import State
 from ..physics.surfaces.thin_walls import require_thick_walls
-from ..physics.world import State
 from .frame_renderer import FrameRenderer
 from .loop_physics import SIZES, DeviceState, numbers_of, state_of, stepper_of
 

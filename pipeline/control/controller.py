@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...datasets.models.model import Model, read_model
 from ...schemas import JOINTS, ControlTask, SolverName, UsageError, read_task
+from ..physics.model_world import world_of_model
 from ..physics.world import World
 from ..runtime.device import resolve_device
 from ..synthesize.parameters import draw_parameters, with_correlations
@@ -63,7 +64,7 @@ class Controller(PlanningController):
         found = self.task_world
 
         def planned(drawn: Model | None) -> World:
-            return found.planning(None if drawn is None else World.from_model(drawn, geometry=found.world))
+            return found.planning(None if drawn is None else world_of_model(drawn, geometry=found.world))
 
         worlds = drawn_worlds(found.model, draws, seed, where, planned)
         super().__init__(task.planner, worlds, solver_of(solver, Mppi(task.planner.samples)), where, seed)

@@ -12,7 +12,7 @@ from torch import Tensor
 from ...datasets.capture.cameras import Camera
 from ...datasets.models.model import Model
 from ...schemas import InputDataError, UsageError
-from ..physics.world import State
+from ..physics.state import State
 from ..rendering.posed_scene import LabelledModel
 from ..rendering.render import render
 from ..runtime import kernel_build

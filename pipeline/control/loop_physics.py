@@ -8,8 +8,10 @@ from torch import Tensor
 from ...datasets.models.model import Model
 from ..physics.fused.host import lacking
 from ..physics.fused.stepping import FusedStepper
+from ..physics.model_world import world_of_model
+from ..physics.state import State
 from ..physics.stepping import Stepper, TorchStepper
-from ..physics.world import State, World
+from ..physics.world import World
 
 SIZES = {"position_m": 3, "quat_wxyz": 4, "velocity_m_s": 3, "omega_body_rad_s": 3}
 """Fields of a state, and the numbers of each for a body."""
@@ -25,10 +27,10 @@ def stepper_of(model: Model, interval_s: float, device: str, dtype: torch.dtype)
         UsageError: If the kernel supports the world neither on the CPU nor on the CUDA device.
         InputDataError: If the model cannot be simulated.
     """
-    world = World.from_model(model, dtype)
+    world = world_of_model(model, dtype)
     if lacking(world) is None:
         return FusedStepper(world, interval_s), world
-    world = World.from_model(model, dtype, device)
+    world = world_of_model(model, dtype, device)
     return (FusedStepper if world.gravity.is_cuda else TorchStepper)(world, interval_s), world
 
 

@@ -15,7 +15,8 @@ from ...schemas import ControlTask
 from ..physics.engine import rollout
 from ..physics.kinematic import Drive
 from ..physics.rollout import Rollout
-from ..physics.world import State, World
+from ..physics.state import State
+from ..physics.world import World
 from .horizon import Forecast, Horizon, Targets
 from .proposals import PushProposals
 from .task_world import TaskWorld

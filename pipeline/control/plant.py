@@ -11,7 +11,8 @@ import torch
 
 from ...schemas import JOINTS
 from ..physics.engine import rollout
-from ..physics.world import State, World
+from ..physics.state import State
+from ..physics.world import World
 from .horizon import Array
 from .objective import drive_of
 from .planning import ControlState

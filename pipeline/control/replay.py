@@ -23,7 +23,7 @@ from ...schemas import (
     read_json,
 )
 from ...schemas.documents import parse_json
-from ..physics.world import State
+from ..physics.state import State
 from ..runtime.checkpoint import Checkpoint
 from .film import AHEAD_S, predicted_at, visible_model
 from .hand.film import dotted_model

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...datasets.rollouts.replay import Replay
-from ..physics.world import State
+from ..physics.state import State
 from .horizon import Array
 
 

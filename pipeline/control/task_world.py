@@ -18,10 +18,13 @@ from ...datasets.models.model import Model
 from ...datasets.shapes.ply import Splats
 from ...schemas import BodyModel, ControlTask, InputDataError, ModelFile, did_you_mean
 from ..geometry.rotation import quat_multiply, quat_to_matrix
+from ..physics.body import Body
 from ..physics.checks import DEEPEST_SHARE, overlaps, require_apart
 from ..physics.contact_law import ContactLaw
+from ..physics.model_world import world_of_model
 from ..physics.paper_law import PaperLaw
-from ..physics.world import Body, State, World
+from ..physics.state import State
+from ..physics.world import World
 from .goal import PlanarGoal, turned
 
 LEVEL_DEG = 1.0
@@ -127,7 +130,7 @@ def task_world(model: Model, task: ControlTask) -> TaskWorld:
     name = free_object(model.file, task.object, task.source)
     file, collision = _with_finger(model, task, name)
     reduced = replace(model, file=file, collision=collision)
-    world = World.from_model(reduced)
+    world = world_of_model(reduced)
     _require_level(world, model)
     pose = model.body(name).photo_pose
     goal = PlanarGoal(

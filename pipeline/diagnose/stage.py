@@ -35,6 +35,7 @@ from ...schemas import (
 from ...schemas.printable import typed_path
 from ..physics.effects.recording import no_recording
 from ..physics.effects.registry import effect_names, effect_of, load_effect, split_units
+from ..physics.model_world import world_of_model
 from ..physics.rollout_cost import durations, segment_part
 from ..physics.world import World
 from ..report.page_file import shows_the_same
@@ -321,7 +322,7 @@ def _world(model: Model, capture: Capture) -> World:
             f"run 'cgwm fit {typed_path(capture.root)} --out MODEL'.",
         )
     refuse_paper_law(model.file, model.place, "diagnose")
-    world = World.from_model(model)
+    world = world_of_model(model)
     ground = capture.manifest.world.ground
     if ground is None or world.ground_offset is None:
         return world

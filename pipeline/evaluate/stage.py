@@ -29,6 +29,7 @@ from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.loader import RolloutReader
 from ...schemas import ErrorSummary, EvalResult, InputDataError, Reference, UsageError
 from ...schemas.printable import typed_path
+from ..physics.model_world import world_of_model
 from ..physics.world import World
 from ..rendering.video_view import renderable, usable_cameras
 from ..report.page_file import shows_the_same
@@ -149,7 +150,7 @@ def evaluate_model(
         See :func:`evaluate`.
     """
     check_bodies(model, capture.body_names, str(capture.root))
-    world = World.from_model(model)
+    world = world_of_model(model)
     uncertainty: dict[str, PoseUncertainty] | None = None
     if _by_images(model, capture, split, reference):
         filmed = filmed_poses(world, model, capture, split, device)
@@ -239,7 +240,7 @@ def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s:
             raise InputDataError(f"{dataset}: split '{split}' has no rollout.", todo="name another with --split.")
         names = [name.decode() for name in reader.group(0)["bodies/names"][()]]
         check_bodies(model, names, str(dataset))
-        world = World.from_model(model)
+        world = world_of_model(model)
         # A dataset stores true states, not measured ones.
         world = replace(world, effects=tuple(a for a in world.effects if a.effect.phase != "measurement"))
         found = [Episode(info.demo, _stored_tracks(reader, number)) for number, info in enumerate(reader.rollouts)]

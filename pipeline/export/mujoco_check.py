@@ -15,8 +15,9 @@ from ...datasets.models.mjcf import Keyframe
 from ...datasets.models.model import Model
 from ...datasets.shapes.interpolation import by_column
 from ...schemas import SamplingPlan
+from ..physics.model_world import world_of_model
 from ..physics.rollout import require_finite, simulate
-from ..physics.world import State, World
+from ..physics.state import State
 from ..synthesize.plan import resolve_plan
 from ..synthesize.start_states import Start, draw_start
 
@@ -75,7 +76,7 @@ def resimulate(model: Model, mjcf: str, start: Start, duration_s: float) -> Devi
         NotConvergedError: If our rollout diverges.
     """
     times = np.arange(round(duration_s / FRAME_S) + 1) * FRAME_S
-    world = World.from_model(model, torch.float64)
+    world = world_of_model(model, torch.float64)
     parts = (start.position_m, start.quat_wxyz, start.velocity_m_s, start.omega_body_rad_s)
     state = State(*(torch.as_tensor(part, dtype=torch.float64)[None] for part in parts))
     with torch.no_grad():
@@ -110,7 +111,7 @@ def link_deviation(model: Model, mjcf: str, seed: int) -> tuple[float, float]:
     Returns:
         The largest distance of their origins [mm], and the largest angle between them [deg].
     """
-    rng, world = np.random.default_rng(seed), World.from_model(model, torch.float64)
+    rng, world = np.random.default_rng(seed), world_of_model(model, torch.float64)
     loaded = mujoco.MjModel.from_xml_string(mjcf)
     data = mujoco.MjData(loaded)
     expected = {}

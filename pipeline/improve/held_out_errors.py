@@ -17,7 +17,7 @@ from ..compare.paired_difference import LEAST_EPISODES, RESAMPLES
 from ..compare.short_horizon_errors import DIVERGED
 from ..diagnose.evidence.cross_validation import continued
 from ..optimization.tails import student_quantile
-from ..physics.world import World
+from ..physics.model_world import world_of_model
 from ..runtime.resources import one_torch_thread
 from ..segments.prepare import Prepared, prepare
 from ..segments.random_effects import with_fitted_groups
@@ -47,7 +47,7 @@ class HeldOutErrors(FileModel):
 @one_torch_thread()
 def prepared_episodes(model: Model, capture: Capture, names: Sequence[str]) -> tuple[list[Episode], Prepared]:
     """Return episodes and their segments, which are the same for all models that are compared on them."""
-    world, given = World.from_model(model), capture.manifest.measurement
+    world, given = world_of_model(model), capture.manifest.measurement
     episodes, _ = episodes_at_clock(capture, names, [world.bodies[k].name for k in world.tracked])
     return episodes, prepare(world, episodes, (given.position_std_m, given.rotation_std_rad))
 
@@ -65,7 +65,7 @@ def typical_errors(model: Model, capture: Capture, episodes: Sequence[Episode], 
         episodes: Name and tracks by body of each episode.
         prepared: The same episodes, cut into segments.
     """
-    world = World.from_model(model)
+    world = world_of_model(model)
     flown = after_release(episodes, prepared.released_s)
     world = with_fitted_groups(world, flown, model.file, capture.groups, prepared.noise)
     whole = replace(

@@ -30,7 +30,7 @@ from ..diagnose.next_experiment.experiments import DEFAULT, experiments_of, read
 from ..diagnose.report.pictures import DrawnMotion, throw_of
 from ..diagnose.stage import library_of
 from ..fit import fit
-from ..physics.world import World
+from ..physics.model_world import world_of_model
 from ..runtime.device import resolve_device
 from .folds import ReadOnce, folds_of
 from .ladder import Climb, Ladder
@@ -296,4 +296,4 @@ def _asked(result: ImproveResult, files: LadderFiles) -> tuple[DrawnMotion, ...]
     step = asking_step(result.steps)
     if step is None or step.next_experiment is None:
         return ()
-    return throw_of(World.from_model(read_model(files / (step.next_model or step.model))), step.next_experiment)
+    return throw_of(world_of_model(read_model(files / (step.next_model or step.model))), step.next_experiment)

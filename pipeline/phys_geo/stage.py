@@ -29,10 +29,13 @@ from ...schemas import (
     UsageError,
 )
 from ...schemas.materials import pair_of
+from ..physics.body import Body
 from ..physics.chains.values import FACTORS, with_chain_values
 from ..physics.effects.registry import effect_of
+from ..physics.inertia import inertia_elements
+from ..physics.model_world import world_of_model
 from ..physics.rollout_cost import durations
-from ..physics.world import Body, World, inertia_elements
+from ..physics.world import World
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
 from ..runtime.work_budget import motion_doubt, within_budget
@@ -78,23 +81,23 @@ def fit_motion(
     else:
         config = paper_config(model.file, capture, config)
     ready = _with_surfaces(replace(model, file=_physics_start(model, capture, config)), capture)
-    solver = ready.file.solver.model_copy(update={"sweeps": _sweeps(World.from_model(ready))})
+    solver = ready.file.solver.model_copy(update={"sweeps": _sweeps(world_of_model(ready))})
     ready = replace(ready, file=ready.file.model_copy(update={"solver": solver}))
     if config.supervise == "tracks":
-        warnings = (*warnings, *require_outside(World.from_model(ready), capture, split))
+        warnings = (*warnings, *require_outside(world_of_model(ready), capture, split))
     started = time.perf_counter()
     found = _fitted_motion(ready, capture, split, config, checkpoint, model.file.contact is not None)
     found = replace(found, warnings=(*found.warnings, *found.record.unconverged(), *warnings))
     seconds = round(time.perf_counter() - started, 2)
     record = found.record.to_json() | {"seconds": seconds, "supervise": config.supervise}
     record |= {"warnings": list(found.warnings)}
-    fitted = _merge(ready.file, World.from_model(ready), found)
+    fitted = _merge(ready.file, world_of_model(ready), found)
     fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
     ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
     if config.supervise == "tracks" and not ready.file.articulations:
         free = {body.name for body in ready.file.bodies if body.motion == "free"}
         timed = with_regular_times(track_episodes(capture, split), free)[0]
-        described = not_described(World.from_model(ready), timed, found.noise)
+        described = not_described(world_of_model(ready), timed, found.noise)
         ready = replace(ready, file=ready.file.model_copy(update={"not_described": described}))
     if ready.scene is not None and capture.cameras is not None and _has_video(capture, split):
         ready = _with_appearance(ready, capture, split, config, found)
@@ -175,7 +178,7 @@ def _fitted_motion(
     ready: Model, capture: Capture, split: str, config: PhysConfig, checkpoint: Checkpoint, warm_started: bool
 ) -> PhysicsFit:
     """Fit the physics to tracks or videos; `warm_started`: whether the contact parameters come from an earlier fit."""
-    world = replace(World.from_model(ready), rolls_on=resolve_device(config.device).type)
+    world = replace(world_of_model(ready), rolls_on=resolve_device(config.device).type)
     if config.supervise == "tracks":
         measured = capture.manifest.measurement
         noise = (measured.position_std_m, measured.rotation_std_rad)

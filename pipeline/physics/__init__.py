@@ -1,13 +1,17 @@
 """Contact geometry, dynamics and simulation of bodies made of spheres."""
 
+from .body import Body
 from .chains.chain import Chain, Joint
 from .chains.joint_command import JointCommand
 from .chains.state import joints_of, with_joints
 from .contact_law import ContactLaw, damping_ratio_of, restitution
 from .contact_record import ContactRecord
+from .inertia import symmetric
+from .model_world import world_of_model
 from .paper_law import PaperLaw
 from .rollout import Rollout, simulate
-from .world import Body, State, World, symmetric
+from .state import State
+from .world import World
 
 __all__ = [
     "Body",
@@ -26,4 +30,5 @@ __all__ = [
     "simulate",
     "symmetric",
     "with_joints",
+    "world_of_model",
 ]

@@ -17,8 +17,9 @@ from .contact_detection import GROUND, Placed, body_points, near_body, pairs_of,
 from .contact_law import ContactLaw
 from .pair_laws import laws_in_use
 from .paper_law import PaperLaw, stable_step
+from .state import State
 from .surfaces.detection import surface_depth
-from .world import State, World
+from .world import World
 
 DEEPEST_SHARE = 0.25
 """Maximum initial overlap as a share of the smaller radius; from deeper overlaps contact would throw bodies apart."""

@@ -16,11 +16,12 @@ from torch import Tensor
 
 from ..geometry.rotation import cross
 from ..optimization.forward_mode import parts_of
+from .body import Body
 from .edge_contact import FACE_SLACK_M, Crossings, Edges, best_normal, slots_of
 from .hull import MOST_PLANES, Hull, hull_distance, parallel_face, parting
 from .smooth_distance import blended, log_sum_exp_distance, smooth_min
 from .surfaces.fixed_surface import HALF_SPACE
-from .world import Body, World
+from .world import World
 
 PAIR_SMOOTHING_M = 1e-3
 """Width of the smooth minimum in the distance between two bodies [m]."""

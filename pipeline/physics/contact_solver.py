@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ...schemas import UsageError
 from ..geometry.rotation import cross
+from .body import Body
 from .chains.stepping import ChainStepper, owners
 from .contact_detection import (
     GROUND,
@@ -31,7 +32,7 @@ from .paper_law import PaperLaw, paper_impulses
 from .rigid_body import Inertia, Motion
 from .surfaces.detection import Nearby, near_surface, surface_points
 from .surfaces.fixed_surface import FixedSurface
-from .world import Body, World
+from .world import World
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .chains.chain import Chain
 from .chains.state import made_likewise
-from .world import State
+from .state import State
 
 T = TypeVar("T")
 

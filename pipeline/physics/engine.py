@@ -20,7 +20,8 @@ from .fused import simulate_fused, unsupported
 from .fused.host import lacking, simulate_on_host
 from .kinematic import Drive
 from .rollout import Rollout, simulate
-from .world import State, World
+from .state import State
+from .world import World
 
 if TYPE_CHECKING:
     from ...datasets.capture.tracks import Track

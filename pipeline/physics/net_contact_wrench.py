@@ -6,7 +6,7 @@ import numpy as np
 
 from ...datasets.rollouts.rollouts import ContactTable
 from ..geometry.viewpoint import rotation_matrix
-from .world import symmetric
+from .inertia import symmetric
 
 
 def contact_force_n(contacts: ContactTable, time_s: np.ndarray, bodies: int) -> np.ndarray:

@@ -11,7 +11,8 @@ from torch import Tensor
 from .effects.effect import Poses
 from .engine import rollout as rolled_out
 from .rollout import Rollout
-from .world import State, World
+from .state import State
+from .world import World
 
 if TYPE_CHECKING:
     from ...datasets.capture.tracks import Track

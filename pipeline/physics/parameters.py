@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from ...schemas.materials import of_pair
+from .body import Body
 from .chains.values import with_chain_values
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
+from .inertia import stretched_inertia
 from .pair_laws import laws_in_use
 from .paper_law import PaperLaw
-from .world import Body, World, stretched_inertia
+from .world import World
 
 Law = TypeVar("Law", bound=ContactLaw | PaperLaw)
 

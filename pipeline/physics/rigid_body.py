@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.rotation import cross, quat_exp, quat_multiply, quat_normalize, quat_rotate, quat_to_matrix
-from .world import Body
+from .body import Body
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,8 @@ from .contact_solver import Contacts, PairImpulses
 from .effects.effect import BodyMotion, changed_by_effects
 from .kinematic import Drive
 from .rigid_body import Inertia, Motion, advance, finish, start
-from .world import State, World
+from .state import State
+from .world import World
 
 if TYPE_CHECKING:
     from ...datasets.capture.tracks import Track

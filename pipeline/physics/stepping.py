@@ -16,7 +16,8 @@ from .checks import require_physical, require_state
 from .kinematic import Drive
 from .rigid_body import Motion
 from .rollout import Engine
-from .world import State, World
+from .state import State
+from .world import World
 
 
 class Stepper(Protocol):

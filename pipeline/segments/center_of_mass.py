@@ -16,8 +16,9 @@ from torch import Tensor
 from ...datasets.capture.tracks import Episode, Track
 from ...schemas import InputDataError
 from ..geometry.rotation import quat_rotate
+from ..physics.body import Body
 from ..physics.chains.chain import Chain
-from ..physics.world import Body, World
+from ..physics.world import World
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import cut_episodes, size_of, whole_episodes
 from ..trajectories.track_noise import noise_of

@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..physics.world import Body, World
+from ..physics.body import Body
+from ..physics.world import World
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import size_of
 from .thresholds import SEGMENT_THRESHOLDS

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..physics.body import Body
 from ..physics.contact_law import ContactLaw, Touch
 from ..physics.effects.effect import ActiveEffect, BodyMotion
 from ..physics.impulse_solver import tangent_axes
-from ..physics.world import Body, World
+from ..physics.world import World
 
 SLICES = 24
 """Number of increments of the normal impulse."""

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ...datasets.capture.tracks import Episode
 from ...schemas import InputDataError
-from ..physics.world import Body, World
+from ..physics.body import Body
+from ..physics.world import World
 from ..trajectories.initial_state import clearance
 from ..trajectories.observations import Observations, refuse_slow_times
 from ..trajectories.segmentation import size_of, whole_episodes

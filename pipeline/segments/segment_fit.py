@@ -13,7 +13,8 @@ from torch import Tensor
 from ..optimization.least_squares import Policy, descend
 from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..physics.parameters import Parameter, apply_parameters
-from ..physics.world import State, World
+from ..physics.state import State
+from ..physics.world import World
 from .candidates import base_values
 from .segment_states import best_of, normal_equations
 from .segments import Segments

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..optimization.least_squares import Policy, descend
 from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ..physics.parameters import Parameter
-from ..physics.world import State
+from ..physics.state import State
 from ..trajectories.residuals import STATE_SIZE, retract, state_prior
 from .segments import START_FRAMES, Segments, line_state
 from .thresholds import SEGMENT_THRESHOLDS

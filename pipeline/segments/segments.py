@@ -17,7 +17,8 @@ from ..physics.engine import rollouts_at_once
 from ..physics.observation_model import measure, true_times
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
-from ..physics.world import State, World
+from ..physics.state import State
+from ..physics.world import World
 from ..trajectories.innovations import WHITE, NoiseModel, body_innovations
 from ..trajectories.observations import Observations, with_spins
 from ..trajectories.residuals import STATE_SIZE, TrajectoryResiduals, retract

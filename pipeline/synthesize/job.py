@@ -15,7 +15,7 @@ from ...datasets.io.atomic import sha256
 from ...datasets.models.model import Model, read_model
 from ...datasets.rollouts.shards import shard_range
 from ...schemas import DatasetManifest, InputDataError, ModelFile, SamplingPlan, SynthesizeConfig, UsageError
-from ..physics.world import World
+from ..physics.model_world import world_of_model
 from ..rendering.ground_shadow import shadow_of
 from ..rendering.label_renderer import LabelRenderer
 from ..runtime.device import resolve_device
@@ -86,7 +86,7 @@ def _with_plan(path: Path, plan: SamplingPlan) -> tuple[Model, SamplingPlan]:
             todo="fit it again: cgwm fit CAPTURE --out MODEL.",
         )
     if model.file.contact is None:
-        World.from_model(model)  # raises an error that names missing physics
+        world_of_model(model)  # raises an error that names missing physics
     model = replace(model, file=with_correlations(model))
     require_admissible(model.file, plan.parameters, plan.source)
     return model, resolve_plan(model, plan)

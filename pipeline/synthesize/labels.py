@@ -14,7 +14,7 @@ from ...schemas import ModelFile, SamplingPlan
 from ..physics.chains.chain import chain_of_model
 from ..physics.chains.state import joint_values
 from ..physics.net_contact_wrench import contact_force_n, contact_torque_n_m
-from ..physics.world import State
+from ..physics.state import State
 from .pusher_paths import commanded_velocity
 from .simulator import Motion
 from .start_states import Start

@@ -29,9 +29,11 @@ from ..physics.engine import rollout as roll_out
 from ..physics.fused import unsupported
 from ..physics.fused.host import lacking
 from ..physics.kinematic import Drive
+from ..physics.model_world import world_of_model
 from ..physics.rollout import Rollout, require_finite
+from ..physics.state import State
 from ..physics.surfaces.thin_walls import require_thick_walls
-from ..physics.world import State, World
+from ..physics.world import World
 from ..runtime.kernel_build import compiler_version
 from .draw import Draw
 from .start_states import Start
@@ -82,7 +84,7 @@ class Simulator:
     """
 
     def __init__(self, model: Model, times_s: np.ndarray, device: str) -> None:
-        self._world = World.from_model(model)
+        self._world = world_of_model(model)
         self._times = torch.as_tensor(times_s, dtype=torch.float64, device=device)
         self._device = device
         self._together = device == "cuda" and unsupported(on_device(self._world, device)) is None
@@ -114,7 +116,7 @@ class Simulator:
     def _at_once(self, draws: Sequence[Draw], seed: int, size: int) -> list[Motion | Diverged]:
         names = [f"rollout {draw.index} (seed {seed})" for draw in draws]
         filled = [*draws, *[draws[-1]] * (size - len(draws))]
-        worlds = [World.from_model(draw.model, geometry=self._world) for draw in draws]
+        worlds = [world_of_model(draw.model, geometry=self._world) for draw in draws]
         for world, draw, name in zip(worlds, draws, names, strict=True):
             require_apart(world, _state([draw.start]), name)
             require_thick_walls(world, _state([draw.start]), name)

@@ -10,10 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from ...datasets.models.model import Model
+from ..physics.body import Body
 from ..physics.contact_detection import Placed
+from ..physics.model_world import fixed_surfaces
 from ..physics.surfaces.detection import surface_depth
 from ..physics.surfaces.fixed_surface import HALF_SPACE, FixedSurface
-from ..physics.world import Body, fixed_surfaces
 from .plan import up_direction
 
 Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ import math
 from ...datasets.models.model import Model
 from ...schemas import SamplingPlan, SynthesizeConfig
 from ..physics.contact_detection import pairs_of, slot_count
+from ..physics.model_world import world_of_model
 from ..physics.rollout_cost import rollout_seconds
-from ..physics.world import World
 from ..runtime.work_budget import Part, duration
 
 LESS = "ask for fewer --rollouts, or a smaller --set synthesize.duration_s, frame_rate_hz, width or height."
@@ -39,7 +39,7 @@ def synthesis_parts(
         device: cpu or cuda.
         at_once: Number of rollouts in memory together.
     """
-    world = World.from_model(model)
+    world = world_of_model(model)
     bodies, frames = len(world.bodies), config.duration_s * config.frame_rate_hz + 1
     views = plan.views if model.body_splats else 0
     slots = sum(slot_count(world, pair) for pair in pairs_of(world))

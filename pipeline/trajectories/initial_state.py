@@ -9,11 +9,12 @@ from torch import Tensor
 
 from ..geometry.rotation import continuous_turns, quat_to_matrix
 from ..optimization.levenberg_marquardt import Solution, minimise
+from ..physics.body import Body
 from ..physics.chains.state import on_joints
 from ..physics.contact_detection import Placed
 from ..physics.smooth_distance import union_distance
 from ..physics.surfaces.detection import surface_gap
-from ..physics.world import Body, World
+from ..physics.world import World
 from .observations import START_FRAMES, Observations, straight_line
 from .residuals import STATE_SIZE, TrajectoryResiduals, retract, state_prior
 from .track_noise import Noise

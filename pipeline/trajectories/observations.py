@@ -17,7 +17,8 @@ from ..geometry.rotation import continuous_turns, matrix_to_quat
 from ..physics.chains.state import on_joints
 from ..physics.kinematic import Drive
 from ..physics.parameters import with_own
-from ..physics.world import State, World
+from ..physics.state import State
+from ..physics.world import World
 from .track_noise import moves
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from ..physics.engine import length_groups, ragged_rollout
 from ..physics.observation_model import measure
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.rollout import Rollout
-from ..physics.world import State, World
+from ..physics.state import State
+from ..physics.world import World
 from .observations import Observations
 
 STATE_SIZE = 12

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from ...datasets.capture.tracks import Episode
 from ..geometry.rotation import continuous_turns, quat_to_matrix
-from ..physics.world import Body, World
+from ..physics.body import Body
+from ..physics.world import World
 from .initial_state import FLIGHT_MARGIN_M, clearance
 from .observations import Observations
 from .thresholds import TRACK_THRESHOLDS

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from ...datasets.models.model import Model
+from ..physics.model_world import fixed_surfaces
 from ..physics.surfaces.fixed_surface import FixedSurface
-from ..physics.world import fixed_surfaces
 from .faults import Fault
 from .rollout import Rollout
 

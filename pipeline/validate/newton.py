@@ -18,9 +18,10 @@ from ...schemas import EffectModel
 from ..geometry.viewpoint import rotation_matrix
 from ..physics.effects import load_effect
 from ..physics.effects.registry import BUILT_IN
+from ..physics.model_world import world_of_model
 from ..physics.net_contact_wrench import contact_torque_n_m
 from ..physics.rollout import Engine
-from ..physics.world import State, World
+from ..physics.state import State
 from .faults import Fault
 from .rollout import Rollout
 
@@ -150,7 +151,7 @@ def _loads(
     keys = ("pos", "quat_wxyz", "vel", "omega_body")
     state = State(*(torch.as_tensor(read[key], dtype=torch.float64) for key in keys))
     times = torch.tensor([[0.0, 1.0]], dtype=torch.float64).expand(len(read["pos"]), -1)
-    engine = Engine(World.from_model(replace(model, file=file)), state, times, {})
+    engine = Engine(world_of_model(replace(model, file=file)), state, times, {})
     with torch.no_grad():
         pull, torque = engine.loads(engine.begin(state))[index]
     return pull.numpy(), torque.numpy()

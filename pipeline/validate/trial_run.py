@@ -18,9 +18,11 @@ from ..physics.checks import require_apart
 from ..physics.effects.registry import BUILT_IN
 from ..physics.engine import rollout
 from ..physics.fused.host import lacking
+from ..physics.model_world import world_of_model
 from ..physics.rollout import Rollout, simulate
+from ..physics.state import State
 from ..physics.surfaces.thin_walls import thin_wall_warnings
-from ..physics.world import State, World
+from ..physics.world import World
 
 LENGTH_S = 1.0
 """Length of the trial run [s]; shorter where the steps or sweeps are many."""
@@ -49,7 +51,7 @@ def run_faults(model: Model) -> tuple[list[str], dict[str, str]]:
         facts["simulated_without_effects"] = ", ".join(left_out)
     try:
         with torch.no_grad():
-            world = World.from_model(replace(model, file=file))
+            world = world_of_model(replace(model, file=file))
             state = _start(world, file)
             thin = thin_wall_warnings(world)
             _require_own_values(model, file, world)
@@ -84,7 +86,7 @@ def _require_own_values(model: Model, file: ModelFile, world: World) -> None:
             effects = list(file.effects)
             effects[place] = effect.model_copy(update={"parameters": effect.parameters | values})
             own = replace(model, file=file.model_copy(update={"effects": tuple(effects)}))
-            World.from_model(own, geometry=world)
+            world_of_model(own, geometry=world)
 
 
 def _start(world: World, file: ModelFile) -> State:

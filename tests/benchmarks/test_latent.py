@@ -17,7 +17,7 @@ from cgwm.datasets.models.model import Model, write_model
 from cgwm.datasets.synthetic.dynamics import ContactTruth
 from cgwm.datasets.synthetic.objects import make_object
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
-from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.rendering.label_renderer import LabelRenderer
 from helpers.small_model import cube_splats, small_model, table_splats
 

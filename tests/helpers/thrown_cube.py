@@ -11,7 +11,7 @@ from cgwm.datasets.capture.images import write_image
 from cgwm.datasets.capture.tracks import Track, write_tracks
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.evaluate.prediction import Motion
-from cgwm.pipeline.physics import State, World
+from cgwm.pipeline.physics import State, world_of_model
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.rendering.label_renderer import LabelRenderer
 from cgwm.pipeline.rendering.video_view import expose
@@ -44,7 +44,7 @@ def thrown(seed: int) -> tuple[np.ndarray, Motion]:
         torch.tensor(0.2 * rng.standard_normal((1, 1, 3))),
     )
     times = np.arange(FRAMES) / RATE_HZ
-    rollout = roll_out(World.from_model(truth()), state, torch.tensor(times))
+    rollout = roll_out(world_of_model(truth()), state, torch.tensor(times))
     return times, Motion(rollout.position_m[0].numpy(), rollout.quat_wxyz[0].numpy())
 
 

@@ -14,7 +14,7 @@ from cgwm.datasets.capture.images import read_label, write_image
 from cgwm.datasets.capture.tracks import Track, write_tracks
 from cgwm.datasets.models.model import Model, write_model
 from cgwm.pipeline.geometry.rotation import quat_exp
-from cgwm.pipeline.physics import State, World, engine
+from cgwm.pipeline.physics import State, engine, world_of_model
 from cgwm.pipeline.rendering.label_renderer import LabelRenderer
 from cgwm.schemas import CamerasFile, PosedVideo, Scale, Solver
 from helpers.small_model import HALF, MASS, collision_splats, cube_splats, small_model, table_splats
@@ -54,7 +54,7 @@ def start_state() -> State:
 def thrown() -> Track:
     """The cube from `start_state` on."""
     times = torch.arange(FRAMES, dtype=torch.float64) / RATE_HZ
-    rollout = engine.rollout(World.from_model(tiny_model()), start_state(), times)
+    rollout = engine.rollout(world_of_model(tiny_model()), start_state(), times)
     return Track(times.numpy(), rollout.position_m[0, :, 0].numpy(), rollout.quat_wxyz[0, :, 0].numpy())
 
 

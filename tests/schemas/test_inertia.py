@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from cgwm.pipeline.physics.world import inertia_elements, symmetric
+from cgwm.pipeline.physics.inertia import inertia_elements, symmetric
 from cgwm.schemas.capture import physical_inertia
 
 

@@ -17,7 +17,7 @@ from ....datasets.rollouts.control_file import RunTables
 from ....datasets.shapes.ply import Splats
 from ...geometry.rotation import quat_to_matrix
 from ...geometry.viewpoint import look_at
-from ...physics.world import Body
+from ...physics.body import Body
 from ..film import AHEAD_S, ANGLE_DEG, SIZE, Image, filmed, predicted_at
 from ..frame_renderer import FrameRenderer
 from ..horizon import Array

@@ -14,7 +14,7 @@ from ...geometry.rotation import quat_turn
 from ...physics.chains.joint_command import JointCommand
 from ...physics.engine import rollout
 from ...physics.rollout import Rollout
-from ...physics.world import State
+from ...physics.state import State
 from ..horizon import Array, Forecast, Targets
 from ..objective import Draw, Worlds, costs_of
 from .world import HandWorld

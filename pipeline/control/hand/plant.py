@@ -13,7 +13,7 @@ from ....schemas import HandPlantSection, HandTask, InputDataError, NotConverged
 from ...physics.chains.joint_command import JointCommand
 from ...physics.chains.state import joints_of
 from ...physics.engine import rollout
-from ...physics.world import State
+from ...physics.state import State
 from ..horizon import Array
 from ..planning import ControlState
 from ..plant import changed_world

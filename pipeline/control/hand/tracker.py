@@ -13,7 +13,7 @@ from torch import Tensor
 from ...geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_turn
 from ...physics.chains.joint_command import JointCommand
 from ...physics.engine import rollout
-from ...physics.world import State
+from ...physics.state import State
 from ..horizon import Targets
 from ..objective import Worlds
 from ..planning import ControlState

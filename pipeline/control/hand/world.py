@@ -17,13 +17,16 @@ from ....datasets.robots import Articulation, read_articulation
 from ....schemas import HandTask, InputDataError, require_joints
 from ....schemas.materials import pair_of
 from ...geometry.directions import fibonacci_directions
+from ...physics.body import Body
 from ...physics.chains.articulated import Servo, chain_of
 from ...physics.chains.chain import Chain, Joint
 from ...physics.chains.state import require_touching, with_joints
 from ...physics.checks import require_apart
 from ...physics.contact_law import ContactLaw
 from ...physics.hull import Hull
-from ...physics.world import Body, State, World
+from ...physics.model_world import world_of_model
+from ...physics.state import State
+from ...physics.world import World
 from ...sg_gs.link_hulls import Balls, link_hulls, rounded_hull, whole_hull
 from ..horizon import Array
 from ..task_world import free_object, require_metric, require_rigid, softened
@@ -298,7 +301,7 @@ def world_of(model: Model, task: HandTask, chain: Chain, links: Sequence[Body], 
     Raises:
         InputDataError: If the model has another contact law than that of cgwm.
     """
-    alone, name = World.from_model(model, joins_others=True), free_object(model.file, task.object, task.source)
+    alone, name = world_of_model(model, joins_others=True), free_object(model.file, task.object, task.source)
     thing = alone.bodies[alone.body_names.index(name)]
     law = alone.contact
     if not isinstance(law, ContactLaw):

@@ -25,7 +25,8 @@ from torch import Tensor
 
 from ...physics.effects.effect import ActiveEffect
 from ...physics.parameters import Parameter, apply_parameters
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...segments.candidates import base_parameters, base_values
 from ...segments.linearization import Linearization, linearize
 from ...segments.segment_fit import robust_excess

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...geometry.rotation import quat_to_matrix
-from ...physics.world import Body
+from ...physics.body import Body
 from ...segments.prepare import Prepared
 from ..thresholds import THRESHOLDS
 from .own_accelerations import OwnAccelerations, follows

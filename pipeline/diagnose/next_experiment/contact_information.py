@@ -24,7 +24,8 @@ from ...physics.engine import rollout as rolled_out
 from ...physics.observation_model import as_measured, true_times
 from ...physics.parameters import Parameter
 from ...physics.rollout import Rollout
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...segments.candidates import Variant, base_values, with_variants
 from ...segments.impacts.fit import ImpactBase
 from ...segments.impacts.velocities import measured_impacts

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from ....schemas import InputDataError, ThrowGrid, ThrowsFile, read_toml
 from ...physics.impulse_solver import tangent_axes
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 
 MOST_THROWS = 400
 """Maximum number of throws; more would take minutes to compare."""

@@ -15,7 +15,8 @@ from ...physics.engine import rollout as rolled_out
 from ...physics.observation_model import as_measured, true_times
 from ...physics.parameters import PRIOR_SCALES
 from ...physics.rollout import Rollout
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...segments.candidates import Variant, acts_in, base_parameters
 from ...segments.contact_phases import is_round
 from ...segments.linearization import linearize

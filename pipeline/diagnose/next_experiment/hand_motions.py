@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...geometry.rotation import quat_to_matrix
+from ...physics.body import Body
 from ...physics.impulse_solver import tangent_axes
-from ...physics.world import Body, State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...segments.contact_phases import is_round
 from ...segments.impact_law import contact_law
 

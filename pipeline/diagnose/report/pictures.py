@@ -14,7 +14,8 @@ from torch import Tensor
 from ....schemas import DiagnoseResult, NextExperiment, NotConvergedError
 from ...physics.engine import rollout
 from ...physics.impulse_solver import tangent_axes
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...segments.candidates import without_effects
 from ...segments.flights.residual_wrench import ResidualWrenches, covariates_of, motion_axes, wrench_windows
 from ...segments.prepare import Prepared, whole_flights

@@ -14,7 +14,8 @@ from ....schemas import PhysConfig
 from ...optimization.levenberg_marquardt import minimise
 from ...physics.observation_model import measure
 from ...physics.parameters import apply_parameters
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...trajectories.initial_state import estimate_states, warmup_frames
 from ...trajectories.observations import Observations
 from ...trajectories.residuals import TrajectoryResiduals, retract, state_prior

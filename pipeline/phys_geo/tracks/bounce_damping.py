@@ -21,7 +21,8 @@ from torch import Tensor
 from ...physics.contact_law import ContactLaw, damping_ratio_of, restitution
 from ...physics.engine import rollout
 from ...physics.parameters import CONTACT_TIME, DAMPING_RATIO, Parameter
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...segments.first_contact_fit import placed
 from ...segments.impacts.bounces import gravity_into_ground
 from ...segments.impacts.restitution import RestitutionFit

@@ -19,7 +19,8 @@ from ...optimization.uncertainty import correlation_of
 from ...physics.contact_law import ContactLaw, restitution
 from ...physics.paper_law import PaperLaw
 from ...physics.parameters import CONTACT_PARAMETERS, CONTACT_TIME, DAMPING_RATIO, GROUND_SHIFT, Parameter
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...report.page import listed
 from ...segments.first_contact_fit import EffectEstimate
 from ...segments.fitted_parameters import bound_warnings, fitted_parameter

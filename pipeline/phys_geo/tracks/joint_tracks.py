@@ -14,7 +14,8 @@ from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply
 from ...physics.chains.chain import Chain
 from ...physics.chains.dynamics import Balance, ChainDynamics, ChainMotion
 from ...physics.chains.state import joint_values
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...trajectories.observations import Observations
 from ...trajectories.track_noise import Noise
 

@@ -32,7 +32,8 @@ from ...physics.engine import rollout as rolled_out
 from ...physics.observation_model import as_measured, true_times
 from ...physics.parameters import Parameter, apply_parameters
 from ...physics.rollout import Rollout
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...trajectories.observations import Observations
 from ...trajectories.residuals import retract, state_prior
 from ...trajectories.track_noise import Noise

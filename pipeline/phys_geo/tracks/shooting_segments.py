@@ -13,7 +13,8 @@ from torch import Tensor
 from ....datasets.capture.tracks import Episode
 from ...geometry.rotation import quat_turn
 from ...optimization.problem import NormalEquations
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...trajectories.initial_state import FLIGHT_MARGIN_M, clearance, separate_frames
 from ...trajectories.observations import Observations
 from ...trajectories.track_noise import Noise

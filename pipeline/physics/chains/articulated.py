@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ....datasets.robots import Articulation, JointOfRobot, LinkOfRobot
 from ....schemas import UsageError
+from ..body import Body
 from ..smooth_distance import plane_contacts
-from ..world import Body
 from .chain import Chain, Joint
 
 Array = NDArray[np.float64]

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from ...geometry.rotation import cross, quat_exp, quat_multiply, quat_normalize, quat_to_matrix
+from ..body import Body
 from ..rigid_body import Motion
-from ..world import Body
 from .chain import Chain, link_velocities
 from .joint_command import JointCommand
 

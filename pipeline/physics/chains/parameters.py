@@ -9,8 +9,9 @@ import math
 
 from torch import Tensor
 
+from ..body import Body
 from ..parameters import Parameter
-from ..world import Body, World
+from ..world import World
 from .chain import Chain, Joint
 from .values import moving_links
 

@@ -14,7 +14,9 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from ....schemas import InputDataError, UsageError
 from ...geometry.rotation import cross, quat_conjugate, quat_exp, quat_multiply, quat_rotate
 from ...optimization.forward_mode import parts_of
-from ..world import Body, State, World
+from ..body import Body
+from ..state import State
+from ..world import World
 from .chain import BASES, Chain, JointFrames, link_velocities
 
 OFF_JOINT_M, OFF_JOINT_RAD = 1e-5, 1e-4

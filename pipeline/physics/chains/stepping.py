@@ -12,7 +12,8 @@ from ...geometry.rotation import cross, quat_conjugate, quat_rotate
 from ..impulse_solver import Rows
 from ..kinematic import Drive
 from ..rigid_body import Motion
-from ..world import State, World
+from ..state import State
+from ..world import World
 from .chain import Chain
 from .dynamics import ChainDynamics, ChainMotion, Kick, LinkWrench, target_of
 from .joint_command import JointCommand

@@ -12,7 +12,8 @@ from torch import Tensor
 from .chain import Chain, Joint
 
 if TYPE_CHECKING:
-    from ..world import Body, World
+    from ..body import Body
+    from ..world import World
 
 FACTORS = (".mass_factor", ".inertia_factor")
 """Ends of names of parameters that are relative to the model from which a fit started."""

@@ -18,8 +18,9 @@ from ....schemas import UsageError
 from ..impulse_solver import tangent_axes
 
 if TYPE_CHECKING:
+    from ..body import Body
     from ..contact_law import Touch
-    from ..world import Body, World
+    from ..world import World
 
 Values = Mapping[str, Tensor]
 """The values of an effect's parameters and constants by name, each of shape (1,) or (n,)."""

@@ -7,7 +7,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..world import World, stretched_inertia
+from ..inertia import stretched_inertia
+from ..world import World
 from .effect import Effect, EffectParameter, Values, vector
 
 _AXES = ("xx", "yy", "zz", "xy", "xz", "yz")

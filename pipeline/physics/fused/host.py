@@ -20,7 +20,8 @@ from ...runtime.resources import kernel_threads
 from ..chains.joint_command import JointCommand
 from ..kinematic import Drive
 from ..rollout import Rollout
-from ..world import State, World
+from ..state import State
+from ..world import World
 from .packing import reason_against
 from .rollout import roll
 from .structure import MOTION_COLUMNS, Structure, kernel_file

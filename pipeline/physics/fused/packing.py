@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from ..body import Body
 from ..chains.joint_command import JointCommand
 from ..contact_detection import GROUND, edge_slots, pairs_of, slot_count
 from ..contact_law import ContactLaw, coefficients
 from ..kinematic import Drive
 from ..pair_laws import laws_in_use
 from ..rigid_body import start
+from ..state import State
 from ..surfaces.fixed_surface import HALF_SPACE, FixedSurface
-from ..world import Body, State, World
+from ..world import World
 from . import tree, wrenches
 from .commands import Commands
 from .layout import in_frame, joined, quat_in_frame, upright

@@ -19,7 +19,8 @@ from ..contact_record import ContactRecord
 from ..effects.effect import changed_by_effects
 from ..kinematic import Drive
 from ..rollout import Rollout
-from ..world import State, World
+from ..state import State
+from ..world import World
 from .launch import block_room, launch, launch_away
 from .packing import Packed, pack, reason_against
 from .structure import FRAME_WIDTH, LABEL_WIDTH, SHARED_BYTES, Structure, lanes_for

@@ -13,7 +13,8 @@ from ..chains.joint_command import JointCommand
 from ..checks import require_physical, require_state
 from ..effects.effect import changed_by_effects
 from ..kinematic import Drive
-from ..world import State, World
+from ..state import State
+from ..world import World
 from .commands import Commands
 from .host import lacking, launch_on_host
 from .launch import block_room, launch

@@ -15,7 +15,8 @@ from ...optimization.forward_mode import parts_of
 from ..chains.chain import Chain
 from ..chains.joint_command import JointCommand
 from ..chains.state import joints_of
-from ..world import State, World
+from ..state import State
+from ..world import World
 
 LINK_COLUMNS, JOINT_COLUMNS, COMMAND_WIDTH = 20, 9, 14
 """Columns of a link and of a moving joint, as `load_chain` in `kernels/chain.cuh` reads them, and numbers of a row of a

@@ -23,7 +23,8 @@ import torch
 from ....schemas import InputDataError
 from ..contact_detection import plain
 from ..contact_law import ContactLaw
-from ..world import State, World
+from ..state import State
+from ..world import World
 from .fixed_surface import BOX, CYLINDER, HALF_SPACE, FixedSurface
 from .surface_mesh import SurfaceMesh
 

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from ...geometry.rotation import quat_to_matrix
+from ...physics.body import Body
 from ...physics.effects.effect import ActiveEffect, BodyMotion
-from ...physics.world import Body
 from ..segments import Segments
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ...geometry.rotation import quat_rotate
 from ...optimization.tails import chi2_tail
+from ...physics.body import Body
 from ...physics.effects.effect import ActiveEffect, BodyMotion, Effect
 from ...physics.effects.linear_drag import LinearDrag
 from ...physics.effects.magnus_lift import MagnusLift
@@ -19,7 +20,7 @@ from ...physics.effects.quadratic_drag import QuadraticDrag
 from ...physics.effects.residual_wrench import AXES, ResidualWrench
 from ...physics.effects.spin_damping import SpinDamping
 from ...physics.parameters import effect_parameters
-from ...physics.world import Body, World
+from ...physics.world import World
 from ...trajectories.innovations import WHITE, NoiseModel
 from ...trajectories.observations import Observations
 from ...trajectories.segmentation import Segment

@@ -14,7 +14,7 @@ from torch import Tensor
 from ...optimization.least_squares import Policy, descend
 from ...optimization.problem import Box, NormalEquations, Point, Problem, Rows
 from ...physics.parameters import Parameter
-from ...physics.world import State
+from ...physics.state import State
 from ...trajectories.residuals import retract
 from ..segments import Segments
 from .residuals import LoadErrors, chi2_by_segment, finite_differences

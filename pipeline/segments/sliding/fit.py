@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ...physics.contact_law import ContactLaw
 from ...physics.parameters import FRICTION, GROUND_SHIFT, Parameter, effect_parameters
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...trajectories.bursts import without_grounded_bursts
 from ...trajectories.residuals import STATE_SIZE, TrajectoryResiduals
 from ..candidates import Together, Variant, base_parameters, base_values

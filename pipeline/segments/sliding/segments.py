@@ -17,7 +17,8 @@ from torch import Tensor
 
 from ...geometry.rotation import quat_conjugate, quat_log, quat_multiply, quat_to_matrix
 from ...physics.impulse_solver import tangent_axes
-from ...physics.world import State, World
+from ...physics.state import State
+from ...physics.world import World
 from ...trajectories.observations import Observations
 from ...trajectories.segmentation import GroundPlane, Segment, heights_of, size_of, without_rest
 from ...trajectories.thresholds import TRACK_THRESHOLDS

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ...physics.parameters import FRICTION
-from ...physics.world import State
+from ...physics.state import State
 from ..candidates import Variant, base_values, with_variants
 from ..segments import Segments
 from .descent import fit_groups, information_by_segment

@@ -11,7 +11,7 @@ from cgwm.datasets.models.mjcf import write_mjcf
 from cgwm.datasets.models.model import Model
 from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.pipeline.phys_geo.material_pairs import given_numbers, start_laws, touching_bodies
-from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics import world_of_model
 from cgwm.pipeline.synthesize.parameters import draw_parameters, settable, with_parameter
 from cgwm.schemas import (
     Body,
@@ -47,10 +47,10 @@ def model(**more: object) -> Model:
 
 
 def test_the_only_pair_in_use_is_the_contact_of_the_world() -> None:
-    world = World.from_model(model())
+    world = world_of_model(model())
     assert float(world.contact.friction) == 0.2 and not world.pair_laws
     other = model(pairs=(PAIR.model_copy(update={"materials": ("ice", "wood")}),), parameters=())
-    assert float(World.from_model(other).contact.friction) == 0.4
+    assert float(world_of_model(other).contact.friction) == 0.4
 
 
 def test_rollouts_draw_the_parameters_of_a_pair() -> None:

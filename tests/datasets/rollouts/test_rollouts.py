@@ -263,8 +263,9 @@ def test_mjcf_camera_sees_what_ours_sees() -> None:
 def test_mujoco_flies_as_the_stored_states_say() -> None:
     """A free joint's convention is ours: velocity of the body origin in world axes, spin in body axes."""
     import torch
+    from cgwm.pipeline.physics.model_world import world_of_model
     from cgwm.pipeline.physics.rollout import simulate
-    from cgwm.pipeline.physics.world import State, World
+    from cgwm.pipeline.physics.state import State
 
     model = small_model(com_m=(0.01, -0.004, 0.006))
     times = np.arange(0, 0.101, 0.02)
@@ -273,7 +274,7 @@ def test_mujoco_flies_as_the_stored_states_say() -> None:
         one * torch.tensor([0.0, 0, 1]), one * torch.tensor([1.0, 0, 0, 0]), one * torch.tensor([0.3, 0, 1]),
         one * torch.tensor([3.0, 5, -2]),
     )  # fmt: skip
-    rollout = simulate(World.from_model(model), state, torch.as_tensor(times))
+    rollout = simulate(world_of_model(model), state, torch.as_tensor(times))
     parts = (rollout.position_m, rollout.quat_wxyz, rollout.velocity_m_s, rollout.omega_body_rad_s)
     states = mujoco_states(model.file, times, tuple(part[0].numpy() for part in parts))  # pyright: ignore
     loaded = mujoco.MjModel.from_xml_string(write_mjcf(model))

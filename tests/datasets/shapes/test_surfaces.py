@@ -15,7 +15,7 @@ from cgwm.datasets.models.model import read_model, write_model
 from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.datasets.shapes.surfaces import obj_text, read_surface, stored
 from cgwm.pipeline.geometry.rotation import quat_to_matrix
-from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics import world_of_model
 from cgwm.pipeline.physics.surfaces.fixed_surface import BOX, CYLINDER, HALF_SPACE, MESH
 from cgwm.schemas import InputDataError, Surface
 from helpers.fixed_surfaces import box_mesh, groove
@@ -73,7 +73,7 @@ def test_a_model_keeps_its_surfaces(tmp_path: Path) -> None:
     assert again.file.surfaces == written.file.surfaces
     shape = again.file.surfaces[0].mesh
     assert shape is not None and (shape.path, shape.inside) == ("tray.obj", "none")
-    world = World.from_model(again)
+    world = world_of_model(again)
     assert [one.kind for one in world.surfaces] == [MESH, BOX, CYLINDER, BOX, HALF_SPACE]
     assert world.surfaces[1].size.tolist() == [[0.1, 0.2, 0.0]] and world.surfaces[3].material == "wood"
     mesh = world.surfaces[0].mesh
@@ -100,7 +100,7 @@ def test_surfaces_are_where_mujoco_puts_them() -> None:
     scene = mujoco.MjModel.from_xml_string(write_mjcf(model))
     data = mujoco.MjData(scene)
     mujoco.mj_forward(scene, data)
-    world = World.from_model(model)
+    world = world_of_model(model)
     rotation = quat_to_matrix(world.surfaces[0].quat_wxyz)[0].numpy()
     for one in shapes[1:]:
         geom = scene.geom(one.name).id

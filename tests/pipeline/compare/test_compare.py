@@ -22,7 +22,7 @@ from cgwm.pipeline.compare.stage import Comparison, compare, compare_models
 from cgwm.pipeline.compare.verdict import comparison_verdict
 from cgwm.pipeline.evaluate import evaluate
 from cgwm.pipeline.evaluate.prediction import Motion
-from cgwm.pipeline.physics import State, World, engine
+from cgwm.pipeline.physics import State, engine, world_of_model
 from cgwm.pipeline.report.page_file import shows_the_same
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.schemas import PHASES, CompareResult, EffectModel, UsageError
@@ -187,7 +187,7 @@ def flights(root: Path, model: Model, turned: bool = True) -> Path:
     rows = [((-0.5, 0.1 * k, 2.0), (0.5 - 0.2 * k, 0.3, 2.5), (1.0, 0.5 * k, 0.0)) for k in range(len(paths))]
     place, velocity, omega = (torch.tensor(part).double()[:, None] for part in zip(*rows, strict=True))
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).double().expand(len(paths), 1, 4)
-    rollout = engine.rollout(World.from_model(model), State(place, upright, velocity, omega), torch.tensor(times))
+    rollout = engine.rollout(world_of_model(model), State(place, upright, velocity, omega), torch.tensor(times))
     for seed, path in enumerate(paths):
         motion = Motion(rollout.position_m[seed].numpy(), rollout.quat_wxyz[seed].numpy())
         write_tracks(path, {"cube": measured(times, motion, seed, turned)}, overwrite=True)
@@ -246,7 +246,7 @@ def test_a_driven_body_and_two_free_ones(tmp_path: Path) -> None:
     rest = torch.tensor([[[0.0, 0, HALF - 2e-4], [0, 0, 0], [0.0, 0.4, HALF - 2e-4]]]).double()
     unturned = torch.tensor([[[1.0, 0.0, 0.0, 0.0]] * 3]).double()
     state = State(rest, unturned, torch.zeros(1, 3, 3).double(), torch.zeros(1, 3, 3).double())
-    rollout = engine.rollout(World.from_model(model), state, torch.tensor(times), {"tip": command})
+    rollout = engine.rollout(world_of_model(model), state, torch.tensor(times), {"tip": command})
     tracks = {"tip": command}
     for seed, (place, name) in enumerate(((0, "cube"), (2, "other"))):
         own = [rollout.position_m[0, :, [place]].numpy(), rollout.quat_wxyz[0, :, [place]].numpy()]
@@ -503,7 +503,7 @@ def test_the_ladder_has_every_episode_and_the_zeros() -> None:
 def test_short_errors_leave_the_states_their_freedom(folder: Path) -> None:
     """Each segment's leverages add up to the numbers of its state."""
     capture = Capture.open(folder / "capture")
-    world = World.from_model(truth())
+    world = world_of_model(truth())
     episodes = [(name, capture.tracks(name)) for name in capture.episodes("test")]
     given = capture.manifest.measurement
     prepared = prepare(world, episodes, (given.position_std_m, given.rotation_std_rad))

@@ -8,7 +8,7 @@ from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.compare.residual_wrenches import wrench_points
 from cgwm.pipeline.compare.short_horizon_errors import short_errors
-from cgwm.pipeline.physics import State, World, simulate
+from cgwm.pipeline.physics import State, World, simulate, world_of_model
 from cgwm.pipeline.physics.chains.state import with_joints
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.schemas import PHASES
@@ -46,14 +46,14 @@ def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def heavier(model: Model) -> World:
     """Return the world of the model with a second link of three times the mass and inertia."""
-    world = World.from_model(model)
+    world = world_of_model(model)
     upper, lower = world.bodies
     return replace(world, bodies=(upper, replace(lower, mass=3 * lower.mass, inertia=3 * lower.inertia)))
 
 
 def test_a_throw_is_within_the_noise_of_its_own_world_and_not_of_one_with_other_masses() -> None:
     model = jointed_model()
-    world = World.from_model(model)
+    world = world_of_model(model)
     episodes = [thrown(world)]
     prepared = prepare(world, episodes, NOISE)
     assert prepared.flight is not None and not prepared.contact_items

@@ -15,7 +15,8 @@ from cgwm.pipeline.physics.fused.launch import launch
 from cgwm.pipeline.physics.fused.rollout import Launch, roll
 from cgwm.pipeline.physics.fused.stepping import FusedStepper
 from cgwm.pipeline.physics.kinematic import Drive
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.model_world import world_of_model
+from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.rendering.label_renderer import LabelRenderer
 from cgwm.pipeline.runtime import kernel_build
 from cgwm.schemas import InputDataError, Light, NotConvergedError, UsageError
@@ -63,7 +64,7 @@ def pushed(steps: int = STEPS) -> tuple[Drive, list[Velocity]]:
 def test_steps_are_those_of_one_rollout_and_frames_those_of_datasets(device: str) -> None:
     model = small_model(driven=True)
     drive, commands = pushed()
-    world = World.from_model(model)
+    world = world_of_model(model)
     expected = rollout(world, start(), drive.times_s[0], {"tip": drive})
     loop = ClosedLoop(model, camera(), DT, device)
     frames, states = [loop.reset(start())], []
@@ -98,7 +99,7 @@ def test_steps_are_those_of_one_rollout_and_frames_those_of_datasets(device: str
     ],
 )
 def test_the_kernel_goes_on_where_it_ended(device: str, run: Launch | None, lanes: int | None) -> None:
-    world, (drive, _) = World.from_model(small_model(driven=True), device=device), pushed()
+    world, (drive, _) = world_of_model(small_model(driven=True), device=device), pushed()
     first = State(*(value.to(device) for value in vars(start()).values()))
     whole = Drive(*(value.to(device) for value in vars(drive).values()))
     expected = roll(run or launch, world, first, whole.times_s, {"tip": whole}, lanes=lanes)

@@ -10,8 +10,10 @@ from cgwm.pipeline.physics.chains.joint_command import JointCommand
 from cgwm.pipeline.physics.chains.state import joints_of, with_joints
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.physics.fused.stepping import FusedStepper
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.physics.rollout import simulate
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from cgwm.schemas import UsageError
 from helpers import fused_host
 from helpers.jointed_model import HEIGHT_M, jointed_model
@@ -37,7 +39,7 @@ def start(world: World, angle: float) -> State:
 
 def test_servo_targets_are_those_of_one_rollout() -> None:
     model = served()
-    world = World.from_model(model)
+    world = world_of_model(model)
     targets, began = [0.3, -0.2], 0.1
     loop = ClosedLoop(model, None, DT)
     frame = loop.reset(start(world, began))
@@ -60,7 +62,7 @@ def test_servo_targets_are_those_of_one_rollout() -> None:
 
 def test_a_target_at_once_is_faster_than_a_linear_one() -> None:
     model = served()
-    world = World.from_model(model)
+    world = world_of_model(model)
     moved = []
     for hold in ("linear", "zero"):
         loop = ClosedLoop(model, None, DT)
@@ -82,7 +84,7 @@ def test_a_target_at_once_is_faster_than_a_linear_one() -> None:
 def test_wrong_commands_are_refused(command: dict, words: str) -> None:
     model = served()
     loop = ClosedLoop(model, None, DT)
-    loop.reset(start(World.from_model(model), 0.0))
+    loop.reset(start(world_of_model(model), 0.0))
     with pytest.raises(UsageError, match=f"(?s){words}"):
         loop.step(command)
 
@@ -90,9 +92,9 @@ def test_wrong_commands_are_refused(command: dict, words: str) -> None:
 def test_passive_joints_have_no_targets_and_driven_roots_are_refused() -> None:
     model = jointed_model("fixed")
     loop = ClosedLoop(model, None, DT)
-    loop.reset(start(World.from_model(model), 0.0))
+    loop.reset(start(world_of_model(model), 0.0))
     _, state = loop.step()
-    assert float(joints_of(World.from_model(model), state, World.from_model(model).chains[0])[0]) > 0.001
+    assert float(joints_of(world_of_model(model), state, world_of_model(model).chains[0])[0]) > 0.001
     with pytest.raises(UsageError, match="a command for 'arm', which is not driven"):
         loop.step({"arm": Targets({"elbow": 0.1})})
     with pytest.raises(UsageError, match="the root 'upper' of the jointed body 'arm' is driven"):
@@ -103,7 +105,7 @@ def test_passive_joints_have_no_targets_and_driven_roots_are_refused() -> None:
 @pytest.mark.parametrize("lanes", [pytest.param(1, marks=pytest.mark.evidence), 4])
 def test_joints_go_on_where_they_ended_and_a_reset_begins_anew(lanes: int) -> None:
     """The arm falls onto its lower limit, whose impulse warm-starts the next interval."""
-    world = World.from_model(served())
+    world = world_of_model(served())
     chain, first, times = world.chains[0], start(world, -0.9), DT * torch.arange(7, dtype=torch.float64)
     still = JointCommand.hold_still(torch.tensor([[-1.4]], dtype=torch.float64))
     whole = roll(fused_host.run, world, first, times[None], {"arm": still}, lanes=lanes)

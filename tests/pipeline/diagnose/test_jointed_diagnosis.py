@@ -9,7 +9,7 @@ from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.diagnose.stage import library_of, report
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply, quat_rotate
-from cgwm.pipeline.physics import State, World, engine
+from cgwm.pipeline.physics import State, World, engine, world_of_model
 from cgwm.pipeline.physics.chains.state import with_joints
 from cgwm.pipeline.segments.center_of_mass import as_one_body
 from cgwm.pipeline.segments.prepare import prepare
@@ -47,7 +47,7 @@ def throws(world: World, noise: tuple[float, float] = (0.0, 0.0)) -> list[Episod
 
 
 def test_the_centre_of_mass_falls_freely_until_a_link_touches_the_ground() -> None:
-    world = World.from_model(jointed_model())
+    world = world_of_model(jointed_model())
     alone, flown = as_one_body(world, throws(world), (1e-4, 1e-3), "here")
     assert [body.name for body in alone.bodies] == ["arm"] and float(alone.bodies[0].mass) == pytest.approx(0.5)
     for _, tracks in flown:
@@ -60,7 +60,7 @@ def test_the_centre_of_mass_falls_freely_until_a_link_touches_the_ground() -> No
 
 @pytest.mark.parametrize("tilt_rad", [pytest.param(0.0, marks=pytest.mark.evidence), 0.03])
 def test_a_diagnosis_of_the_whole_names_a_tilt_of_gravity_and_nothing_where_there_is_none(tilt_rad: float) -> None:
-    world = World.from_model(jointed_model())
+    world = world_of_model(jointed_model())
     gravity = quat_rotate(quat_exp(torch.tensor([[0.0, tilt_rad, 0.0]], dtype=F64)), world.gravity)
     episodes = throws(replace(world, gravity=gravity), (3e-4, 3e-3))
     alone, flown = as_one_body(world, episodes, (None, None), "here")
@@ -74,7 +74,7 @@ def test_a_diagnosis_of_the_whole_names_a_tilt_of_gravity_and_nothing_where_ther
 
 
 def refused(model: Model) -> None:
-    world = World.from_model(model)
+    world = world_of_model(model)
     with pytest.raises(InputDataError, match=r"here: what moves is 'arm' \(\w+ root\)"):
         as_one_body(world, [], (None, None), "here")
 

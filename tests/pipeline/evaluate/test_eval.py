@@ -13,7 +13,7 @@ from cgwm.datasets.models.model import write_model
 from cgwm.pipeline.evaluate.evaluation import Evaluation
 from cgwm.pipeline.evaluate.prediction import Motion
 from cgwm.pipeline.evaluate.stage import evaluate, evaluate_model
-from cgwm.pipeline.physics import State, World
+from cgwm.pipeline.physics import State, world_of_model
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.trajectories.state_uncertainty import covariance_root
 from cgwm.schemas import EvalResult, InputDataError, SynthesizeConfig, UsageError
@@ -203,7 +203,7 @@ def test_driven_body_follows_its_track(tmp_path: Path) -> None:
     rest = torch.tensor([[[0.0, 0.0, HALF - 2e-4], [0.0, 0.0, 0.0]]]).double()
     unturned = torch.tensor([[[1.0, 0.0, 0.0, 0.0]] * 2]).double()
     state = State(rest, unturned, torch.zeros(1, 2, 3).double(), torch.zeros(1, 2, 3).double())
-    rollout = roll_out(World.from_model(model), state, torch.tensor(times), {"tip": command})
+    rollout = roll_out(world_of_model(model), state, torch.tensor(times), {"tip": command})
     motion = Motion(rollout.position_m[0].numpy(), rollout.quat_wxyz[0].numpy())
     assert motion.position_m[-1, 0, 0] < -0.03  # it was pushed
     cube = measured(times, motion, 0)

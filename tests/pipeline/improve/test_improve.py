@@ -22,7 +22,7 @@ from cgwm.pipeline.improve.page import ladder_html
 from cgwm.pipeline.improve.proposals import Proposal, proposals_of
 from cgwm.pipeline.improve.wording import remaining_words, share_words, worse_words
 from cgwm.pipeline.phys_geo.effects.requested_effects import with_effects
-from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
     DiagnoseResult,
@@ -173,7 +173,7 @@ def test_the_law_of_an_interrupted_ladder_is_run_again(climb: Climb, monkeypatch
     monkeypatch.setenv("CGWM_TRUSTED_EFFECTS", "")  # the next process
     set_errors(monkeypatch, {(): 1.0, ("law_0.py:ResidualLaw",): 0.5})
     climb._trial("m0", "m0-0", Proposal((f"{law}:ResidualLaw",), "law"))
-    World.from_model(read_model(climb.files / "folds" / "m0-0-0"))
+    world_of_model(read_model(climb.files / "folds" / "m0-0-0"))
 
 
 def test_what_the_others_do_without_is_left_out(climb: Climb, monkeypatch: pytest.MonkeyPatch) -> None:

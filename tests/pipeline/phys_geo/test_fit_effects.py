@@ -18,7 +18,7 @@ from cgwm.pipeline.phys_geo.effects.by_motion import fit_effect_flights
 from cgwm.pipeline.phys_geo.effects.effect_fit import fit_effects
 from cgwm.pipeline.phys_geo.effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from cgwm.pipeline.phys_geo.tracks import contact_shooting, open_loop_search
-from cgwm.pipeline.physics import ContactLaw, World
+from cgwm.pipeline.physics import ContactLaw, World, world_of_model
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.observation_model import measure
@@ -110,7 +110,7 @@ def test_a_models_effects_act_in_its_world_and_a_wrong_parameter_is_refused(tmp_
     path = write_small_model(tmp_path / "model")
     model = read_model(path)
     dragged = model.file.model_copy(update={"effects": (EffectModel(name="linear_drag", parameters={"c": 2.0}),)})
-    worlds = [World.from_model(replace(model, file=file)) for file in (model.file, dragged)]
+    worlds = [world_of_model(replace(model, file=file)) for file in (model.file, dragged)]
     start = state_of(
         *[((0, 0, 5.0 * k + 5), (1, 0, 0, 0), (1.0, 0, 0), (0, 0, 0)) for k in range(len(worlds[0].bodies))]
     )
@@ -119,7 +119,7 @@ def test_a_models_effects_act_in_its_world_and_a_wrong_parameter_is_refused(tmp_
     assert ends == [pytest.approx(1.0), pytest.approx(np.exp(-0.4), rel=1e-2)]
     wrong = model.file.model_copy(update={"effects": (EffectModel(name="linear_drag", parameters={"k": 2.0}),)})
     with pytest.raises(InputDataError, match="linear_drag has no k; it has c"):
-        World.from_model(replace(model, file=wrong))
+        world_of_model(replace(model, file=wrong))
 
 
 def test_a_measurement_effect_changes_what_is_seen_and_not_what_happens() -> None:
@@ -158,7 +158,7 @@ def test_what_a_fit_cannot_find_is_refused(tmp_path: Path) -> None:
     ):
         file = model.file.model_copy(update={"effects": (EffectModel(name=name, parameters=values),)})
         with pytest.raises(InputDataError, match=rf"model/model\.json: .*{found}"):
-            World.from_model(replace(model, file=file))
+            world_of_model(replace(model, file=file))
 
 
 def test_up_is_against_gravity_on_a_slope_too() -> None:

@@ -11,7 +11,7 @@ from cgwm.datasets.models.model import read_model, write_model
 from cgwm.pipeline.control.task_world import require_rigid
 from cgwm.pipeline.diagnose import stage
 from cgwm.pipeline.phys_geo.paper_setting import paper_config
-from cgwm.pipeline.physics import ContactLaw, PaperLaw, World
+from cgwm.pipeline.physics import ContactLaw, PaperLaw, world_of_model
 from cgwm.pipeline.physics.parameters import apply_parameters, contact_parameters
 from cgwm.schemas import Body, CaptureManifest, Ground, InputDataError, Material, PhysConfig, UsageError
 from cgwm.schemas import World as Surroundings
@@ -41,14 +41,14 @@ def capture(*materials: Material) -> Capture:
 
 def test_the_model_records_the_law_and_its_world_has_it(tmp_path: Path) -> None:
     write_model(tmp_path / "m", published())
-    world, ours = World.from_model(read_model(tmp_path / "m")), World.from_model(small_model())
+    world, ours = world_of_model(read_model(tmp_path / "m")), world_of_model(small_model())
     assert isinstance(world.contact, PaperLaw) and isinstance(ours.contact, ContactLaw)
     assert float(world.contact.stiffness_n_m) == pytest.approx(MASS / (16 * 0.008**2))
     assert world.bodies[0].on_plane is None and ours.bodies[0].on_plane is not None  # every sphere counts
 
 
 def test_its_numbers_are_fitted_by_the_names_of_ours() -> None:
-    world = World.from_model(published())
+    world = world_of_model(published())
     parameters = contact_parameters(world)
     assert [p.name for p in parameters] == ["friction", "contact_time_s", "damping_ratio"]
     assert [p.prior[0] for p in parameters[1:]] == [0.02, 1.0]

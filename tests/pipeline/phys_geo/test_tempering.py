@@ -7,7 +7,7 @@ import pytest
 import torch
 from cgwm.pipeline.phys_geo.tracks.multiple_shooting import ShootingFit, ShootingPrior
 from cgwm.pipeline.phys_geo.tracks.tempered_posterior import tempered
-from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.physics.state import State
 
 F64 = torch.float64
 EXCESS = 20.0

@@ -9,6 +9,7 @@ import torch
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import simulate
+from cgwm.pipeline.physics.body import Body
 from cgwm.pipeline.physics.checks import overlaps
 from cgwm.pipeline.physics.contact_detection import Placed, all_body_points
 from cgwm.pipeline.physics.edge_contact import Crossings, Edges, best_normal
@@ -18,7 +19,6 @@ from cgwm.pipeline.physics.impulse_solver import tangent_axes
 from cgwm.pipeline.physics.rollout import require_finite
 from cgwm.pipeline.physics.rollout_cost import rollout_part, rollout_seconds
 from cgwm.pipeline.physics.smooth_distance import blended, plane_contacts, smooth_min
-from cgwm.pipeline.physics.world import Body
 from cgwm.schemas import NotConvergedError
 from helpers.worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets import Track
-from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics import World, world_of_model
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.impulse_solver import _share, _share_by_area
 from cgwm.schemas import InputDataError
@@ -166,7 +166,7 @@ def asking(**update: object) -> World:
     """Return the world of the small model's cube with points on its faces."""
     plain = small_model()
     bodies = tuple(body.model_copy(update={"face_points": 12} | update) for body in plain.file.bodies)
-    return World.from_model(replace(plain, file=plain.file.model_copy(update={"bodies": bodies})))
+    return world_of_model(replace(plain, file=plain.file.model_copy(update={"bodies": bodies})))
 
 
 def test_a_model_asks_for_points_on_flat_faces() -> None:

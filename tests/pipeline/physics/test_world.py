@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import torch
 from cgwm.pipeline.physics.engine import rollout
-from cgwm.pipeline.physics.world import State, World
+from cgwm.pipeline.physics.model_world import world_of_model
+from cgwm.pipeline.physics.state import State
+from cgwm.pipeline.physics.world import World
 from helpers.small_model import small_model
 
 
 def test_what_depends_on_the_world_alone_is_made_once_for_each_world() -> None:
-    world, asked = World.from_model(small_model()), []
+    world, asked = world_of_model(small_model()), []
 
     def step(given: World) -> float:
         asked.append(given)
@@ -21,7 +23,7 @@ def test_what_depends_on_the_world_alone_is_made_once_for_each_world() -> None:
 
 
 def test_what_depends_on_a_start_is_kept_until_the_start_is_another_one_or_is_changed_in_place() -> None:
-    world, times, asked = World.from_model(small_model()), torch.zeros(1), []
+    world, times, asked = world_of_model(small_model()), torch.zeros(1), []
     starts = [State(*(torch.zeros(1, 1, size) for size in (3, 4, 3, 3))) for _ in range(2)]
 
     def height(given: World, state: State, times_s: torch.Tensor) -> float:
@@ -39,7 +41,7 @@ def test_a_convex_body_alone_on_the_ground_has_no_hull_and_moves_as_with_one() -
     model = small_model()
     bodies = tuple(body.model_copy(update={"convex": True}) for body in model.file.bodies)
     model = replace(model, file=model.file.model_copy(update={"bodies": bodies}))
-    bare, hulled = World.from_model(model), World.from_model(model, joins_others=True)
+    bare, hulled = world_of_model(model), world_of_model(model, joins_others=True)
     assert bare.bodies[0].hull is None and hulled.bodies[0].hull is not None
     start = State(
         *(torch.tensor([[x]]).double() for x in ([0.0, 0.0, 0.1], [0.8, 0.6, 0.0, 0.0], [1.0, 0, 0], [0.0] * 3))

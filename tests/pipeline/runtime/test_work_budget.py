@@ -10,7 +10,7 @@ import torch
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.evaluate.work import evaluation_parts
 from cgwm.pipeline.phys_geo.work import fit_parts
-from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics import world_of_model
 from cgwm.pipeline.runtime import work_budget
 from cgwm.pipeline.runtime.work_budget import ENDLESS_S, Part, motion_doubt, within_budget
 from cgwm.pipeline.synthesize.shards import synthesize_shards
@@ -66,7 +66,7 @@ def episodes(count: int, end_s: float, frames: int = 50) -> list[Episode]:
 
 
 def test_ordinary_work_is_minutes_at_most_and_absurd_work_is_endless() -> None:
-    world = World.from_model(small_model())
+    world = world_of_model(small_model())
     usual = PhysConfig()
     assert seconds(fit_parts(world, [0.8] * 50, usual)) < 600
     assert seconds(evaluation_parts(world, episodes(10, 600.0), 10)) < 3600  # ten minutes are a legitimate capture
@@ -102,6 +102,6 @@ def test_an_absurd_number_of_shards_is_refused(tmp_path: Path) -> None:
 
 
 def test_no_rollout_has_more_steps_than_can_be_counted() -> None:
-    world = replace(World.from_model(small_model()), step_s=1e-12)
+    world = replace(world_of_model(small_model()), step_s=1e-12)
     with pytest.raises(InputDataError, match=r"1 s of motion in steps of 1e-12 s are 1e\+12 steps"):
         world.substeps(torch.tensor([[0.0, 0.5, 1.0]]))

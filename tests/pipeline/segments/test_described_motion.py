@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.physics.world import Body, World
+from cgwm.pipeline.physics.body import Body
+from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.segments import described_motion
 from cgwm.pipeline.segments.described_motion import LIMITS, _Predicted, _sentence, _supported, not_described
 from cgwm.pipeline.trajectories.initial_state import clearance

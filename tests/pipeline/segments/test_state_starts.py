@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.physics.world import State
+from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.segments import release_detection
 from cgwm.pipeline.segments.impacts.bounces import LIMITS as BOUNCE
 from cgwm.pipeline.segments.impacts.bounces import BounceSide, _turns, bounces_in

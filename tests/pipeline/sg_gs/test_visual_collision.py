@@ -7,7 +7,7 @@ import pytest
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.models.model import read_model, write_model
 from cgwm.pipeline.fit import fit
-from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.sg_gs import bodies
 from cgwm.pipeline.sg_gs.depth_refinement import Refinement
 from cgwm.pipeline.sg_gs.stage import fit_scene
@@ -73,7 +73,7 @@ def test_a_model_whose_visual_spheres_collide_is_simulated_and_written_again(mod
     file = model.file.model_copy(update={"contact": ContactParameters()})
     ready = write_model(tmp_path / "ready", replace(model, file=file))
     assert ready.file.bodies[0].collision is None
-    world = World.from_model(read_model(tmp_path / "ready"))
+    world = world_of_model(read_model(tmp_path / "ready"))
     assert world.bodies[0].radii.shape[1] == len(model.body_splats["ball"])
     config = SynthesizeConfig(rollouts=1, duration_s=0.2, width=32, height=24)
     synthesize(tmp_path / "ready", tmp_path / "dataset", config)

@@ -9,8 +9,8 @@ import torch
 from cgwm.datasets.rollouts.loader import RolloutReader
 from cgwm.datasets.rollouts.rollouts import ContactTable
 from cgwm.pipeline.physics.fused.rollout import roll
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.physics.net_contact_wrench import contact_force_n, contact_torque_n_m
-from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.runtime import kernel_build
 from cgwm.pipeline.synthesize import simulator as batches
 from cgwm.pipeline.synthesize import synthesize
@@ -110,8 +110,8 @@ def test_worlds_are_joined_by_their_numbers() -> None:
     model = small_model()
     heavy = model.file.bodies[0].model_copy(update={"mass_kg": 2 * MASS})
     other = replace(model, file=model.file.model_copy(update={"bodies": (heavy,)}))
-    base = World.from_model(model)
-    joined = joined_worlds([World.from_model(one, geometry=base) for one in (model, other, model)])
+    base = world_of_model(model)
+    joined = joined_worlds([world_of_model(one, geometry=base) for one in (model, other, model)])
     assert joined.bodies[0].mass.tolist() == [MASS, 2 * MASS, MASS]
     assert joined.bodies[0].centers is base.bodies[0].centers
     assert joined.contact.friction.shape == (3,) and joined.ground_normal.shape == (3,)

@@ -10,7 +10,7 @@ import torch
 from cgwm.datasets.capture.spin import require_told_spin
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.geometry.rotation import continuous_turns, quat_exp, quat_log, quat_multiply
-from cgwm.pipeline.physics import State, World
+from cgwm.pipeline.physics import State, World, world_of_model
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.trajectories.initial_state import estimate_states, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
@@ -24,7 +24,7 @@ AXIS = torch.tensor([0.6, 0.0, 0.8]).double()
 
 def spun(turn_rad: float, frames: int) -> tuple[World, Track, torch.Tensor]:
     """Return a world, the track of a cube that spins in flight by an angle a frame, and its angular velocity."""
-    world = World.from_model(small_model())
+    world = world_of_model(small_model())
     omega = turn_rad * RATE_HZ * AXIS
     state = State(
         torch.tensor([[[0.0, 0.0, 3 * HALF + 1.0]]]).double(),

@@ -15,7 +15,7 @@ from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.fit import ASSUMED_DENSITY_KG_M3, fit
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseQuality, PoseTrack, PoseTracker
 from cgwm.pipeline.phys_geo.images.video_episodes import load_video_episode
-from cgwm.pipeline.physics.world import World
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
 from cgwm.schemas import PhysConfig, SplatConfig
 from helpers.pose_search import search_briefly
@@ -79,7 +79,7 @@ def test_poses_are_those_of_the_images_though_tracks_are_there(tmp_path: Path, m
     slot = Checkpoint(tmp_path / "checkpoint", {"all": "0"}, every_s=0.0).slot("poses")
     for again in (False, True):  # found, and of the checkpoint
         episode = load_video_episode(
-            World.from_model(model), model, capture, "000", {}, slot, tracks_too=False, image_size=64,
+            world_of_model(model), model, capture, "000", {}, slot, tracks_too=False, image_size=64,
             device=torch.device("cpu"),
         )  # fmt: skip
         track = episode.tracks["cube"]

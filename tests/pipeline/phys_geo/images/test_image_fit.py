@@ -14,6 +14,7 @@ from cgwm.pipeline.phys_geo.images.contact_spheres import MOVED_STD_M, ContactSp
 from cgwm.pipeline.phys_geo.images.end_to_end import PATIENCE, ImageObjective, refine_end_to_end
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack, PoseTracker
 from cgwm.pipeline.physics import engine
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.physics.rollout import Rollout
 from cgwm.pipeline.physics.world import World
 from cgwm.schemas import PhysConfig, UsageError
@@ -151,7 +152,7 @@ class Scripted(ImageObjective):
 )
 def test_the_step_is_kept_that_explains_what_was_held_out_best(script: list[float], kept: int) -> None:
     model = tiny_model()
-    world = World.from_model(model)
+    world = world_of_model(model)
     rollout = engine.rollout(world, start_state(), torch.arange(FRAMES, dtype=torch.float64) / 30)
     plain = objective_of((model, world, rollout), film(model, rollout))
     shared, states = TRUTH + torch.tensor([0.3, -0.4], dtype=torch.float64), torch.zeros(1, 12, dtype=torch.float64)

@@ -22,6 +22,7 @@ from cgwm.pipeline.phys_geo.images.pose_search import rotation_grid
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTracker
 from cgwm.pipeline.phys_geo.images.video_frames import Footage, Video, load_footage
 from cgwm.pipeline.physics import engine
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.physics.parameters import DAMPING_RATIO, FRICTION, apply_parameters
 from cgwm.pipeline.physics.rollout import Rollout
 from cgwm.pipeline.physics.world import World
@@ -93,7 +94,7 @@ def film(model: Model, rollout: Rollout, masks: bool = True, noise: float = 0.01
 @pytest.fixture(scope="module")
 def scene() -> tuple[Model, World, Rollout]:
     model = tiny_model()
-    world = apply_parameters(World.from_model(model), NAMES, TRUTH.exp()[None])
+    world = apply_parameters(world_of_model(model), NAMES, TRUTH.exp()[None])
     times = torch.arange(FRAMES, dtype=torch.float64) / RATE
     rollout = engine.rollout(world, start_state(), times, record_contacts=True)
     assert rollout.contacts is not None and float(rollout.contacts.impulse_n_s[..., 2].sum()) > 0.1
@@ -276,7 +277,7 @@ def test_a_capture_without_cameras_or_videos_is_told_what_to_do(tmp_path: Path) 
     model = small_model()
     checkpoint = Checkpoint(tmp_path / "checkpoint", {})
     with pytest.raises(InputDataError, match=r"episode '000' has no video(.|\n)*--supervise tracks"):
-        fit_physics_from_images(World.from_model(model), model, capture, "train", PhysConfig(), False, checkpoint)
+        fit_physics_from_images(world_of_model(model), model, capture, "train", PhysConfig(), False, checkpoint)
     folder = tmp_path / "videos" / "left" / "000"
     folder.mkdir(parents=True)
     with pytest.raises(InputDataError, match="cgwm calibrate"):

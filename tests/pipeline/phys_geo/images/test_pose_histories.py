@@ -18,8 +18,8 @@ from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTrack, PoseTracker, 
 from cgwm.pipeline.phys_geo.images.video_episodes import RIVAL_NATS, VideoEpisode, track_warnings
 from cgwm.pipeline.phys_geo.images.video_frames import Footage
 from cgwm.pipeline.physics import engine
+from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.physics.rollout import Rollout
-from cgwm.pipeline.physics.world import World
 from helpers.small_model import HALF, cube_splats, table_splats
 from helpers.tiny_capture import CAMERAS, start_state
 from pipeline.phys_geo.images.test_phys_images import FRAMES, RATE, film, tiny_model
@@ -41,7 +41,7 @@ def two_sided(difference: float) -> Model:
 
 
 def motion(model: Model) -> Rollout:
-    return engine.rollout(World.from_model(model), start_state(), torch.arange(FRAMES, dtype=torch.float64) / RATE)
+    return engine.rollout(world_of_model(model), start_state(), torch.arange(FRAMES, dtype=torch.float64) / RATE)
 
 
 def tracked(model: Model, cameras: int = 2) -> tuple[Footage, PoseTrack, Rollout]:
