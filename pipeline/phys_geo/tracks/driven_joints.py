@@ -20,7 +20,7 @@ It takes a jointed body on a fixed root, alone in its world, whose links touch n
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ....datasets.capture.tracks import Episode, Track
+from ....datasets.capture.tracks import Episode
 from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
 from ...physics.chains.parameters import LOSSES, chain_parameters, mass_factor
 from ...physics.parameters import GAP, Parameter, gap_parameters
@@ -38,47 +38,19 @@ from ...trajectories.initial_state import clearance
 from ...trajectories.observations import Observations
 from ...trajectories.track_noise import Noise, estimate_noise
 from .driven_result import DrivenFit, Pressed
-from .force_driven import LOADED, ForceDriven, Grid, Pushes, Samples, between, hit_errors, impulse_errors, loaded
+from .force_driven import LOADED, ForceDriven, Grid
+from .force_intervals import impulse_variance, kicked_intervals, parts_of_force, senses_of_motion
+from .joint_losses import FLAT, ITERATIONS, ROBUST_SCALE, TOLERANCE, by_differences, information_root, starts, takes
 from .joint_tracks import JointTracks
 from .loss_posterior import posterior
-from .measured_forces import force_noise
+from .pushed_episodes import APART_M, Pushed, pushed_link, pushes_of, sensor_zero
 from .slip_friction import slip_friction
 
-MOST_FRAMES = 400
-"""Maximum number of frames of an episode, counted from shortly before the first force."""
-BEFORE_S = 0.2
-"""How long before the first force [s]."""
-MOST_PARTS = 60
-"""Number of parts of equal length of an episode with an unknown mean force each; parts end at kicks, too, and where the
-sense changes."""
-APART_M = 0.003
-"""Gap between links and what does not drive them above which they touch nothing else [m]."""
-ZERO_M = 0.005
-"""Gap above which a driven body touches nothing, so that its sensor reads its zero [m]."""
-START = 10.0
-"""Standard deviation of the prior of a start, in errors of the first frames."""
-FIRST_FRAMES = 5
-"""Frames of the straight line that is the first guess of a start."""
-STEPS = (0.03, 0.05)
-"""Steps of the differences: of a parameter, and of the other coordinates in their standard deviations."""
-ROBUST_SCALE = 4.0
-"""Scale of the robust loss of a frame, in standard deviations."""
 MANY_EPISODES = 8
 """Number of episodes from which on their scatter counts."""
-KICK = 4.0
-"""Variance of an impulse, relative to the usual one, from which on an interval is a part of its own."""
-OPEN = 10.0
-"""Standard deviation of a force of which only the size is known, dry friction where a joint may stand still or a hit
-between samples, in that size: such forces have a sign, and a narrow prior about 0 would draw the other numbers."""
-MOVES = 4.0
-"""Speed, in standard deviations, above which a joint moves; beside what it may lose between frames."""
-ITERATIONS, TOLERANCE = 80, 1e-5
-"""Limit on steps of a descent, and the share of the cost below which a step ends it."""
 NOTED = ((0.0, 1.0, 5.0), (0.5, 0.5, 1.5), (0.0, 1.0, 5.0))
 """Median, standard deviation and largest size of the delay, in half intervals between samples, of the part of a mean
 that samples are, 0 for samples and 1 for means, and of the offset of the sensor's zero, in its standard deviation."""
-FLAT = 0.1
-"""Information of the prior of a loss in a descent, in its unit, as a root: draws have the real one."""
 MOST_MASS_ERROR = 0.1
 """Standard error of the factor of mass from which on it is not observable: where no push accelerates the body for many
 samples, hits alone tell it, and impulses between samples are not known that well (1.8 for 1 with an error of 0.24)."""
@@ -99,70 +71,16 @@ def fit_driven_joints(
     """
     if not takes(world):
         return None
-    pushed = [one for one in (_Pushed.of(world, episode, force_std_n) for episode in episodes) if one is not None]
+    pushed = [one for one in (Pushed.of(world, episode, force_std_n) for episode in episodes) if one is not None]
     data = _Data.of(world, pushed, noise) if pushed else None
     return None if data is None else _fitted(data)
-
-
-def takes(world: World) -> bool:
-    """Return whether a world is one passive jointed body on a fixed root, beside driven and fixed ones."""
-    one = len(world.chains) == 1 and world.chains[0].base == "fixed" and not world.chains[0].touching
-    one = one and not world.chains[0].has_servos
-    links = set(world.chains[0].links) if one else set()
-    return one and not world.effects and all(world.bodies[k].name in links for k in world.tracked)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Pushed:
-    """Part of an episode in which measured forces drive the links."""
-
-    episode: Episode
-    """Its tracks, those of driven bodies of their whole length."""
-    std_n: dict[str, float]
-    """Noise of a component of the forces of each driven body [N]."""
-
-    @staticmethod
-    def of(world: World, episode: Episode, std_n: float | None) -> _Pushed | None:
-        """Cut an episode; None where a driven body has no forces, or none pushes."""
-        names = [body.name for body in world.bodies if body.motion == "driven" and body.name in episode.tracks]
-        driven = {name: episode.tracks[name] for name in names}
-        if not driven or any(track.force_n is None or len(track) < 3 for track in driven.values()):
-            return None
-        noise = {n: std_n or force_noise(t.force_n) for n, t in driven.items() if t.force_n is not None}
-        pushes = [t.time_s[loaded(t, noise[n], t.time_s)] for n, t in driven.items()]
-        if not any(len(times) for times in pushes):
-            return None
-        begins = min(float(times[0]) for times in pushes if len(times)) - BEFORE_S
-        first = max(begins, *(float(track.time_s[0]) for track in driven.values()))
-        last = min(float(track.time_s[-1]) for track in driven.values())
-        links = {n: t for n, t in episode.tracks.items() if n in world.chains[0].links}
-        times = np.unique(np.concatenate([track.time_s for track in links.values()]))
-        times = times[(times >= first) & (times <= last)][:MOST_FRAMES]
-        if len(times) < FIRST_FRAMES:
-            return None
-        cut = {name: track.window(float(times[0]), float(times[-1])) for name, track in links.items()}
-        kept = {name: track for name, track in cut.items() if len(track)}
-        return _Pushed(episode=Episode(episode.name, kept | driven), std_n=noise)
-
-    def from_zero(self, zeros: Mapping[str, NDArray[np.float64]]) -> _Pushed:
-        """Return the part with forces from other zeros (3,) of the sensors [N], by driven body."""
-        tracks = dict(self.episode.tracks)
-        for name, zero in zeros.items():
-            track = self.force(name)
-            if track is not None and track.force_n is not None:
-                tracks[name] = replace(track, force_n=track.force_n - zero)
-        return replace(self, episode=Episode(self.episode.name, tracks))
-
-    def force(self, name: str) -> Track | None:
-        """Return the track of a driven body with forces, if it is in the episode."""
-        return self.episode.tracks.get(name)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Data:
     """Episodes (E) with T frames of J joints, as a least-squares problem."""
 
-    pushed: Sequence[_Pushed]
+    pushed: Sequence[Pushed]
     driven: ForceDriven
     tracks: JointTracks
     parameters: Sequence[Parameter]
@@ -182,7 +100,7 @@ class _Data:
     shape (P,)."""
 
     @staticmethod
-    def of(world: World, pushed: Sequence[_Pushed], noise: Noise) -> _Data | None:
+    def of(world: World, pushed: Sequence[Pushed], noise: Noise) -> _Data | None:
         """Collect them; None where links touch something else, or it is not clear which link is pushed."""
         seen = Observations.of(world, [one.episode for one in pushed], [(-math.inf, math.inf)] * len(pushed))
         alone = clearance(world, replace(seen, drives={}))
@@ -192,17 +110,19 @@ class _Data:
         tracks = JointTracks.of(world, chain, seen, noise)
         grid = Grid.of(tracks.times_s, tracks.shown)
         names = [body.name for body in world.bodies if body.motion == "driven" and body.name in seen.drives]
-        links = {name: _pushed_link(world, seen, pushed, name) for name in names}
+        links = {name: pushed_link(world, seen, pushed, name) for name in names}
         if any(link is None for link in links.values()):
             return None
-        zeros = {name: _zero(world, seen, pushed, name) for name in names}
+        zeros = {name: sensor_zero(world, seen, pushed, name) for name in names}
         pushed = [one.from_zero({name: zero for name, (zero, _) in zeros.items()}) for one in pushed]
-        pushes = [_push(pushed, name, link, grid, zeros[name][1]) for name, link in links.items() if link is not None]
-        variance = _impulse_variance(world, seen, pushed, tracks, grid, dict(zip(names, pushes, strict=True)))
-        kicks = _kicks(tracks, variance)
+        pushes = [
+            pushes_of(pushed, name, link, grid, zeros[name][1]) for name, link in links.items() if link is not None
+        ]
+        variance = impulse_variance(world, seen, pushed, tracks, grid, dict(zip(names, pushes, strict=True)))
+        kicks = kicked_intervals(tracks, variance)
         tracks = tracks.kicked(kicks)
-        sense, size = _senses(tracks, pushes, grid)
-        part, std = _parts(tracks, sense, kicks, variance, size)
+        sense, size = senses_of_motion(tracks, pushes, grid)
+        part, std = parts_of_force(tracks, sense, kicks, variance, size)
         interval = [float(np.median(np.diff(t.time_s))) for one in pushed for n in names if (t := one.force(n))]
         losses = [p for p in chain_parameters(world) if p.name.endswith(LOSSES)]
         return _Data(
@@ -245,188 +165,6 @@ class _Data:
     def size(self) -> int:
         """Number of coordinates of an episode."""
         return (2 + self.part_std.shape[1]) * self.part_std.shape[2]
-
-
-def by_differences(
-    residuals: Callable[[Tensor, Tensor], Tensor], point: Tensor, count: int, with_jacobian: bool
-) -> tuple[Tensor, Tensor | None]:
-    """Return residuals (E, T, J) and their derivatives (E, T, J, V) by central differences over `STEPS`, or None.
-
-    Args:
-        residuals: Returns residuals (N, T, J) at values (N, V) of the episodes or parts (N,).
-        point: The values (E, V).
-        count: Number of them that are parameters, those first; the others are of states.
-        with_jacobian: Whether the derivatives are wanted.
-    """
-    every = torch.arange(len(point))
-    if not with_jacobian:
-        return residuals(point, every), None
-    steps = torch.tensor([STEPS[0]] * count + [STEPS[1]] * (point.shape[1] - count)).to(point)
-    moves = torch.cat((0 * steps[None], torch.diag(steps), -torch.diag(steps)))
-    moved = (point[None] + moves[:, None]).flatten(0, 1)
-    found = residuals(moved, every.repeat(len(moves))).unflatten(0, (len(moves), -1))
-    ahead, behind = found[1:].chunk(2)
-    return found[0], ((ahead - behind) / (2 * steps[:, None, None, None])).movedim(0, -1)
-
-
-def _pushed_link(world: World, seen: Observations, pushed: Sequence[_Pushed], name: str) -> int | None:
-    """Return the place in the chain of the link that a driven body pushes; None where it may be one of several."""
-    chain = world.chains[0]
-    links = {link: chain.links.index(world.bodies[link_index].name) for link, link_index in enumerate(seen.free)}
-    moving = {column: place for column, place in links.items() if chain.moves(chain.links[place])}
-    if len(moving) == 1:
-        return next(iter(moving.values()))
-    near = {place: _gaps(world, seen, name, column) for column, place in moving.items()}
-    touched = np.zeros(seen.times_s.shape, bool)
-    for e, one in enumerate(pushed):
-        track = one.force(name)
-        if track is not None:
-            touched[e] = loaded(track, one.std_n[name], seen.times_s[e].numpy()) & (seen.seen[e].amax(-1) > 0).numpy()
-    ranked = sorted(near, key=lambda place: float(np.median(near[place][touched])))
-    return ranked[0] if float(near[ranked[1]][touched].min()) > APART_M else None
-
-
-def _gaps(world: World, seen: Observations, name: str, column: int | None = None) -> NDArray[np.float64]:
-    """Return the smallest gap (E, T) [m] between a driven body and the links, or the one in a column of these."""
-    alone = replace(seen, drives={name: seen.drives[name]})
-    if column is not None:
-        alone = replace(
-            alone,
-            free=(seen.free[column],),
-            position_m=seen.position_m[:, :, [column]],
-            quat_wxyz=seen.quat_wxyz[:, :, [column]],
-        )
-    bodies = tuple(body for body in world.bodies if body.motion != "fixed")
-    return clearance(replace(world, bodies=bodies, ground_normal=None, surfaces=()), alone).numpy()
-
-
-def _zero(world: World, seen: Observations, pushed: Sequence[_Pushed], name: str) -> tuple[NDArray[np.float64], float]:
-    """Return what a sensor reads apart from all links (3,) [N], and its error: 0 and the noise where it never is."""
-    gaps, read, noise = _gaps(world, seen, name), [np.zeros((0, 3))], 0.0
-    for e, one in enumerate(pushed):
-        track = one.force(name)
-        if track is not None and track.force_n is not None:
-            count, noise = int(seen.frames[e]), max(noise, one.std_n[name])
-            at = np.interp(track.time_s, seen.times_s[e, :count].numpy(), gaps[e, :count], left=0.0, right=0.0)
-            read.append(track.force_n[at > ZERO_M])
-    every = np.concatenate(read)
-    return (np.median(every, 0), 1.25 * noise / len(every) ** 0.5) if len(every) else (np.zeros(3), noise)
-
-
-def _push(pushed: Sequence[_Pushed], name: str, link: int, grid: Grid, zero_std_n: float) -> Pushes:
-    """Return what a driven body exerts in all steps of the episodes; the zero of its sensor has an error [N]."""
-    tracks = [one.force(name) for one in pushed]
-    samples, none = Samples.of(tracks), torch.zeros(*grid.middle_s.shape, 3).to(grid.middle_s)
-    place, torque = none.clone(), none.clone()
-    for e, track in enumerate(tracks):
-        if track is not None:
-            place[e] = between(track.time_s, track.position_m, grid.middle_s[e])
-            torque[e] = (
-                none[e] if track.torque_n_m is None else between(track.time_s, track.torque_n_m, grid.middle_s[e])
-            )
-    every = torch.arange(len(tracks))
-    force = samples.at(every, grid.middle_s, torch.zeros(len(tracks)).to(none))
-    mean = force.mean((0, 1))
-    offset = zero_std_n * mean / mean.norm().clamp_min(1e-12)
-    return Pushes(link=link, samples=samples, force_n=force, place_m=place, torque_n_m=torque, offset_n=offset)
-
-
-def _impulse_variance(
-    world: World,
-    seen: Observations,
-    pushed: Sequence[_Pushed],
-    tracks: JointTracks,
-    grid: Grid,
-    pushes: Mapping[str, Pushes],
-) -> Tensor:
-    """Return the variance (E, T - 1, J) of the mean generalised force on intervals that samples do not tell."""
-    balance, shape = tracks.balance, tracks.values.shape
-    mass = balance.mass.diagonal(dim1=-2, dim2=-1).unflatten(0, shape[:2])[:, :-1]
-    variance = torch.zeros_like(mass)
-    for name, push in pushes.items():
-        arms = push.arms(balance, tracks, grid)[:, :-1]
-        gaps = _gaps(world, seen, name)
-        for e, one in enumerate(pushed):
-            track, times = one.force(name), tracks.times_s[e].numpy()
-            if track is not None:
-                known = impulse_errors(track, one.std_n[name], times)
-                hits = OPEN * hit_errors(track, one.std_n[name], times, gaps[e])
-                variance[e] += (torch.as_tensor(known)[:, None, None] * arms[e]).square().sum(1)
-                moved = torch.einsum("kcj,c->kj", arms[e], push.direction(e)).abs().clamp_min(1e-6)
-                variance[e] += (mass[e] * torch.as_tensor(hits)[:, None] / moved).square()
-    return variance
-
-
-def _kicks(tracks: JointTracks, variance: Tensor) -> Tensor:
-    """Return the intervals (E, T - 1) whose impulse samples tell much worse than that of most."""
-    seen = tracks.shown[:, 1:, None].expand_as(variance)
-    usual = torch.stack([variance[..., j][seen[..., j]].median() for j in range(variance.shape[2])])
-    return ((variance > KICK * usual) & seen).any(-1)
-
-
-def _senses(tracks: JointTracks, pushes: Sequence[Pushes], grid: Grid) -> tuple[Tensor, Tensor]:
-    """Return the sense (E, T - 1, J) in which joints move on intervals, 0 where one may stand, and what drives them.
-
-    The latter is the root of the mean square (J,) of the generalised force. A joint moves for sure where it is faster
-    than the errors of its speed and than what such a force takes from it in an interval.
-    """
-    balance, shape = tracks.balance, tracks.values.shape
-    total = sum((push.at_frames(balance, tracks, grid) for push in pushes), torch.zeros(shape).to(tracks.values))
-    acts = tracks.shown[..., None] & (total != 0)
-    size = ((total * acts).square().sum((0, 1)) / acts.sum((0, 1)).clamp_min(1)).sqrt().clamp_min(1e-9)
-    mass = balance.mass.diagonal(dim1=-2, dim2=-1).unflatten(0, shape[:2])
-    lost = (size / mass)[:, :-1] * tracks.times_s.diff(dim=1)[..., None]
-    fast = tracks.speeds.abs() - MOVES * tracks.speed_std
-    both = torch.minimum(fast[:, 1:], fast[:, :-1]) > lost
-    sense = tracks.speeds.sign()
-    same = (sense[:, 1:] == sense[:, :-1]) & tracks.shown[:, 1:, None]
-    return torch.where(both & same, sense[:, :-1], torch.zeros_like(lost)), size
-
-
-def _parts(tracks: JointTracks, sense: Tensor, kicks: Tensor, variance: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the part (E, T - 1) of each interval, and the standard deviation (E, parts, J) of its mean force.
-
-    Args:
-        tracks: The joints.
-        sense: Sense in which they move, shape (E, T - 1, J).
-        kicks: Intervals that are parts of their own, shape (E, T - 1).
-        variance: Variance of the mean generalised force on each interval, shape (E, T - 1, J).
-        size: Size of the friction of a joint that may stand still, which lasts, shape (J,).
-    """
-    each = max(1, -(-sense.shape[1] // MOST_PARTS))
-    new = torch.zeros_like(sense[..., 0], dtype=torch.bool)
-    since = torch.zeros(len(sense), dtype=torch.long)
-    for k in range(1, sense.shape[1]):
-        since = since + 1
-        new[:, k] = (since >= each) | (sense[:, k] != sense[:, k - 1]).any(-1) | kicks[:, k] | kicks[:, k - 1]
-        since = torch.where(new[:, k], torch.zeros_like(since), since)
-    part = new.to(torch.long).cumsum(1)
-    length = (tracks.times_s.diff(dim=1) * tracks.shown[:, 1:])[..., None]
-    place = part[..., None].expand_as(sense)
-    none = sense.new_zeros(len(sense), int(part.max()) + 1, sense.shape[2])
-    impulse = none.scatter_add(1, place, variance * length.square()).sqrt()
-    whole = none.scatter_add(1, place, length.expand_as(sense))
-    stands = none.scatter_add(1, place, (sense == 0) * length)
-    std = torch.hypot(impulse / whole.clamp_min(1e-9), OPEN * size * stands / whole.clamp_min(1e-9))
-    return part, torch.where(whole > 0, std, none).clamp_min(1e-9)
-
-
-def starts(tracks: JointTracks) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return first guesses of values and speeds, and the standard deviations of their priors, each (E, J)."""
-    t = (tracks.times_s - tracks.times_s[:, :1])[:, :FIRST_FRAMES, None]
-    first = tracks.values[:, :FIRST_FRAMES]
-    middle, mean = t.mean(1, keepdim=True), first.mean(1, keepdim=True)
-    spread = (t - middle).square().sum(1)
-    speed = ((t - middle) * (first - mean)).sum(1) / spread
-    known = tracks.information[:, :FIRST_FRAMES].diagonal(dim1=-2, dim2=-1).amax(1)
-    error = START * known.clamp_min(1e-12).rsqrt()
-    return mean[:, 0] - speed * middle[:, 0], speed, error, error / spread.sqrt()
-
-
-def information_root(information: Tensor) -> Tensor:
-    """Return the symmetric roots of informations (..., J, J)."""
-    values, axes = torch.linalg.eigh(information)
-    return (axes * values.clamp_min(0.0).sqrt()[..., None, :]) @ axes.transpose(-1, -2)
 
 
 def _first_losses(data: _Data) -> NDArray[np.float64]:

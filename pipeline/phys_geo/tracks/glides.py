@@ -40,7 +40,9 @@ from ...physics.world import World
 from ...trajectories.initial_state import clearance
 from ...trajectories.observations import Observations
 from ...trajectories.track_noise import Noise, estimate_noise
-from .driven_joints import (
+from .driven_result import DrivenFit
+from .force_driven import NEAR_M, ForceDriven, Grid
+from .joint_losses import (
     FLAT,
     ITERATIONS,
     MOST_FRAMES,
@@ -51,8 +53,6 @@ from .driven_joints import (
     starts,
     takes,
 )
-from .driven_result import DrivenFit
-from .force_driven import NEAR_M, ForceDriven, Grid
 from .joint_tracks import JointTracks
 
 FEWEST_FRAMES = 4
