@@ -8,9 +8,10 @@ value or a call whose result is not used; never a docstring, a message or a log.
 code alone: a mutant's rank is the hash of its place by name, so that edits elsewhere do not change it.
 
 `map` runs the suite once and keeps by line the tests that pass and run it. `run` applies each mutant in a copy of the
-tree and runs the tests of its line, the quickest first, until one fails or `--budget` seconds of tests have passed. A
-mutant survives when none fails; with a larger budget the same command goes on with the tests that are left. At the end
-the tests that killed run on the unchanged copy: one that fails there kills nothing.
+tree and runs the tests of its line, the quickest first, until one fails or `--budget` seconds of tests have passed; of
+a line that no mapped test runs, the tests of the folder that mirrors its own. A mutant survives when none fails; with a
+larger budget the same command goes on with the tests that are left. At the end the tests that killed run on the
+unchanged copy: one that fails there kills nothing.
 """
 
 from __future__ import annotations

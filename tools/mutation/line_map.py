@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
 import shutil
 import sys
 import threading
@@ -19,12 +20,13 @@ from types import CodeType, FrameType
 from typing import Any
 
 import pytest
+from changes import FOLDERS
 from spread import spread
 
 PACKAGES = {"cgwm_cli": "cli", "schemas": "schemas", "datasets": "datasets", "pipeline": "pipeline"}
 """Folders of the tree by the name that they have inside the package."""
-TOGETHER = 5
-"""Short files of tests that one process runs."""
+TOGETHER, LONG = 5, 12_000
+"""Short files of tests that one process runs: so many at most, of so many bytes together."""
 Lines = set[tuple[str, int]]
 
 
@@ -218,20 +220,45 @@ def merged(target: Path) -> dict[str, Any]:
     return tests
 
 
-def longest_first(root: Path, work: Path, chosen: Sequence[str]) -> list[str]:
-    """Return the files of tests; with an earlier map those first that took longest, else those of the most text."""
+def in_order(root: Path, work: Path, chosen: Sequence[str]) -> list[str]:
+    """Return the files of tests: those that mirror the folders to change first, and of both the longest first.
+
+    How long is what an earlier map tells; without one the list of the suite's longest files, then their text.
+    """
     known: dict[str, float] = defaultdict(float)
     if (work / "map.json").exists():
         for name, entry in json.loads((work / "map.json").read_text()).items():
             known[name.partition("::")[0]] += entry["seconds"]
+    listed = re.search(r"^LONGEST = \((.*?)^\)", (root / "tests" / "conftest.py").read_text(), re.MULTILINE | re.DOTALL)
+    longest = re.findall(r'"(\w+\.py)"', listed[1])[::-1] if listed else []
     files = [path.relative_to(root).as_posix() for path in (root / "tests").rglob("test_*.py")]
-    sizes = {name: (known[name], (root / name).stat().st_size) for name in chosen or files}
-    return sorted(sizes, key=lambda name: sizes[name], reverse=True)
+
+    def rank(name: str) -> tuple[bool, float, int, int]:
+        near = name.startswith(tuple(mirror_of(folder) for folder in FOLDERS))
+        base = Path(name).name
+        place = longest.index(base) if base in longest else -1
+        return near, known[name], place, (root / name).stat().st_size
+
+    return sorted(chosen or files, key=rank, reverse=True)
 
 
-def batches(names: Sequence[str], alone: int) -> list[Sequence[str]]:
-    """Return the first files alone and the others, which are short, together: each process imports the product."""
-    return [[name] for name in names[:alone]] + [names[k : k + TOGETHER] for k in range(alone, len(names), TOGETHER)]
+def mirror_of(path: str) -> str:
+    """Return the beginning of the names of the tests that mirror a folder, or the folder of a file."""
+    folder = path if not path.endswith(".py") else path.rpartition("/")[0]
+    return f"tests/{folder}/"
+
+
+def batches(root: Path, names: Sequence[str]) -> list[list[str]]:
+    """Return long files alone, and neighbours of short ones together: each process imports the product."""
+    found: list[list[str]] = []
+    size = LONG
+    for name in names:
+        own = (root / name).stat().st_size
+        if size + own > LONG or len(found[-1]) == TOGETHER:
+            found, size = [*found, []], 0
+        found[-1].append(name)
+        size += own
+    return found
 
 
 def make_map(root: Path, work: Path, jobs: int, limit_s: float | None, chosen: Sequence[str]) -> None:
@@ -242,7 +269,7 @@ def make_map(root: Path, work: Path, jobs: int, limit_s: float | None, chosen: S
     environment = environment_of(root) | {"MUTANTS_MAP": str(target)}
     del environment["PYTHONDONTWRITEBYTECODE"]
     words = ["-q", "-p", "line_map", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=short", "-rfEs"]
-    parts = [[*words, *names] for names in batches(longest_first(root, work, chosen), 4 * jobs)]
+    parts = [[*words, *names] for names in batches(root, in_order(root, work, chosen))]
     left = spread(root, target, parts, environment, jobs, limit_s)
     tests = merged(target)
     (work / "map.json").write_text(json.dumps(tests))

@@ -18,11 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from changes import Mutant, applied, sample
-from line_map import PACKAGES, environment_of
+from line_map import PACKAGES, environment_of, mirror_of
 from spread import fork_pytest, kill_group, preload
 
 TEST_START_S, PATIENCE = 45.0, 4.0
 """A run may take so long [s], and so many times what its tests took when they were mapped."""
+
+FRESH = ("new", "not run by a test")
+"""States of mutants that no test has run."""
 
 MOST_TESTS = 400
 """Tests of one run: more than that do not make a survivor likelier to be noticed."""
@@ -149,12 +152,13 @@ def test_all(
     for mutant in mutants:
         entry = results.setdefault(key_of(mutant), asdict(mutant) | {"state": "new", "seconds": 0.0, "ran": []})
         lines = (by_line.get((mutant.path, line), ()) for line in (mutant.line, mutant.statement))
-        covering = [name for name in next(filter(None, lines), ()) if name not in bad]
+        mirror = (name for name in tests if name.startswith(mirror_of(mutant.path)))
+        covering = [name for name in next(filter(None, lines), mirror) if name not in bad]
         spent = sum(tests[name]["seconds"] for name in entry["ran"] if name in tests)
         names = chosen(tests, covering, set(entry["ran"]), options.budget - spent)
         if not covering:
             entry["state"] = "not run by a test"
-        elif entry["state"] == "new" or (entry["state"] == "survived" and names and spent < 0.9 * options.budget):
+        elif entry["state"] in FRESH or (entry["state"] == "survived" and names and spent < 0.9 * options.budget):
             waiting.append((mutant, names))
     began, total = time.monotonic(), len(waiting)
     while waiting or any(slot.pid for slot in slots):
