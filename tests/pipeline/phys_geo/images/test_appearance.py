@@ -23,6 +23,7 @@ from cgwm.pipeline.phys_geo.images.lighting_fit import (
     fit_light,
 )
 from cgwm.pipeline.rendering.relighting import Relighting
+from cgwm.pipeline.runtime import kernel_build
 from cgwm.schemas import Light
 from helpers.small_model import small_model
 
@@ -160,3 +161,16 @@ def test_sides_that_no_photo_shows_get_their_colours_from_the_frames() -> None:
     # without frames, the mean of what is seen stands in, as bright as that side would be
     blind = _colored(model, 0, [], LIGHT, seen, CPU)
     assert np.median(np.abs(blind.colors - ball.colors)[~seen]) < 0.12
+
+
+@pytest.mark.skipif(not kernel_build.available(), reason="needs a CUDA device and cuda-core")
+def test_light_and_colours_are_the_same_on_a_gpu() -> None:
+    model, ball, frames = _ball_filmed(LIGHT)
+    assert ball.normals is not None
+    seen, device = ball.normals[:, 2] > -0.5, torch.device("cuda")
+    for frame in frames[:4]:
+        both = [_ratios(model, frame, {"cube": seen}, where) for where in (CPU, device)]
+        for expected, found in zip(*(one or () for one in both), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-4)
+    expected, found = (_colored(model, 0, frames, LIGHT, seen, where) for where in (CPU, device))
+    np.testing.assert_allclose(found.colors, expected.colors, atol=1e-4)
