@@ -115,7 +115,7 @@ class Frame:
         both = [name for name in found_m if name in true_m]
         true, found = (np.stack([centers[name] for name in both]) for centers in (true_m, found_m))
         arms, reached = true - true.mean(0), found - found.mean(0)
-        turn, _ = Rotation.align_vectors(reached, arms)
+        turn = Rotation.align_vectors(reached, arms)[0]
         scale = float((reached * turn.apply(arms)).sum() / np.square(arms).sum())
         return Frame(scale, turn, found.mean(0) - scale * turn.apply(true.mean(0)))
 
@@ -134,7 +134,7 @@ def _photo_centers(root: Path) -> dict[str, Array]:
     capture, centers = Capture.open(root), dict[str, Array]()
     for name in capture.photos():
         with contextlib.suppress(InputDataError):  # not registered
-            centers[name] = np.linalg.inv(capture.photo_camera(name).T_cam_world)[:3, 3]
+            centers[name] = np.asarray(np.linalg.inv(capture.photo_camera(name).T_cam_world)[:3, 3], float)
     return centers
 
 

@@ -19,14 +19,13 @@ from .faults import Faults
 from .files import files_under, has_folder
 from .folder import CaptureFolder
 from .geometry_maps import KINDS, map_names, read_map
-from .images import IMAGE_SUFFIXES, image_size, read_label
+from .images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, image_size, read_label
 from .video import VIDEO_SUFFIXES, VideoInfo, frame_files, video_info
 
-_UNREAD_IMAGES = (".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif", ".jxl", ".dng", ".raw", ".npy")
 _UNREAD = {
     "tracks": ((".tsv", ".xls", ".xlsx", ".ods"), ".csv.", "convert it, or see 'cgwm import'."),
-    "images": (_UNREAD_IMAGES, ".jpg and .png.", "convert it, for example: magick mogrify -format jpg FILE"),
-    "masks": (_UNREAD_IMAGES, ".png.", "convert it without loss."),
+    "images": (UNREAD_SUFFIXES, ".jpg and .png.", "convert it, for example: magick mogrify -format jpg FILE"),
+    "masks": (UNREAD_SUFFIXES, ".png.", "convert it without loss."),
     "videos": ((".avi", ".mkv", ".m4v"), ".mp4, .mov, .webm, or a directory of frames.", "convert it with ffmpeg."),
 }
 """Suffixes that are not read, in lower case, by folder; which are, and what to do."""

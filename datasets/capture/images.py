@@ -16,8 +16,15 @@ from ...schemas.regular_files import read_binary_file
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 """Suffixes of readable images, in lower case."""
+UNREAD_SUFFIXES = (
+    ".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif", ".jxl", ".dng", ".raw", ".npy",
+)  # fmt: skip
+"""Suffixes of images that are not read, in lower case."""
+HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1")
+"""First brands of HEIF files (ISO/IEC 23008-12), at byte 8; phones and clouds name some of them .jpg."""
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+"""First bytes of a PNG."""
 _JPEG_STANDALONE = {0x01, *range(0xD0, 0xD8)}
 _JPEG_FRAME_HEADERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _REPLACE = "replace the file, or remove it."
@@ -152,12 +159,15 @@ def decoded(path: Path | str, flags: int) -> NDArray:
 
 def _size(path: Path, data: bytes) -> tuple[int, int]:
     try:
-        if data.startswith(_PNG_SIGNATURE):
+        if data.startswith(PNG_SIGNATURE):
             width, height = _png_size(data)
         elif data.startswith(b"\xff\xd8"):
             width, height = _jpeg_size(data)
         else:
-            raise ValueError("neither PNG nor JPEG")
+            is_heif = data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS
+            raise ValueError(
+                "HEIC, whatever its name ('cgwm import photos' converts it)" if is_heif else "neither PNG nor JPEG"
+            )
     except (struct.error, IndexError):
         raise _undecodable(path, data, "truncated") from None
     except ValueError as error:
@@ -178,7 +188,7 @@ def _undecodable(path: Path, data: bytes, reason: str) -> InputDataError:
 
 
 def _png_size(data: bytes) -> tuple[int, int]:
-    offset, size = len(_PNG_SIGNATURE), None
+    offset, size = len(PNG_SIGNATURE), None
     while True:
         length, kind = struct.unpack_from(">I4s", data, offset)
         (checksum,) = struct.unpack_from(">I", data, offset + 8 + length)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,7 +16,7 @@ from ...schemas.imports import ImportResult
 from ...schemas.printable import typed_path
 from ...schemas.regular_files import require_regular_file
 from ..capture.files import entries_of
-from ..capture.images import IMAGE_SUFFIXES, image_size, write_image
+from ..capture.images import HEIF_BRANDS, IMAGE_SUFFIXES, PNG_SIGNATURE, UNREAD_SUFFIXES, image_size, write_image
 from ..capture.manifest import write_manifest
 from ..io.progress import progress
 
@@ -46,9 +46,32 @@ def photos_in(folder: Path) -> list[Photo]:
     files = [path for path in entries_of(folder) if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
     if not files:
         raise _no_photos(folder)
-    photos = [Photo(path, f"{path.stem}.jpg" if _is_heif(path) else path.name) for path in files]
+    photos = [Photo(path, _name_of(path)) for path in files]
+    _refuse_both_kinds(photos)
     require_distinct(photos)
     return photos
+
+
+def _name_of(path: Path) -> str:
+    """Return the name of a photo in the capture: what its content says, where its suffix says HEIC."""
+    if path.suffix.lower() in HEIF_SUFFIXES and _head(path).startswith(PNG_SIGNATURE):
+        return f"{path.stem}.png"
+    return f"{path.stem}.jpg" if path.suffix.lower() in HEIF_SUFFIXES else path.name
+
+
+def _refuse_both_kinds(photos: Sequence[Photo]) -> None:
+    """Refuse a folder that holds photos as HEIC and, converted, as JPEG or PNG too."""
+    kinds: dict[str, set[bool]] = {}
+    for photo in photos:
+        kinds.setdefault(photo.source.stem.lower(), set()).add(photo.source.suffix.lower() in HEIF_SUFFIXES)
+    both = sum(len(kind) == 2 for kind in kinds.values())
+    if both:
+        folder = photos[0].source.parent
+        raise InputDataError(
+            f"{folder}: {both} photos are there as HEIC and as JPEG or PNG.",
+            "each photo once.",
+            "move one of the two kinds to another folder.",
+        )
 
 
 def _require_folder(folder: Path) -> None:
@@ -68,13 +91,22 @@ def _no_photos(folder: Path) -> InputDataError:
     entries = entries_of(folder)
     others = sorted({path.suffix for path in entries if path.suffix})
     posed = any(path.name == "transforms.json" for path in entries)
-    within = next((path for path in entries if path.name == "images" and path.is_dir()), None)
-    todo = "name the folder that holds them" + (f": {within}" if within else "")
+    within = [str(path) for path in entries if path.is_dir() and _holds_photos(path)]
+    todo = "name the folder that holds them"
+    if within:
+        several = f" and {len(within) - 1} more; copy them into one folder" if len(within) > 1 else ""
+        todo += f": {within[0]}{several}"
+    elif any(suffix.lower() in UNREAD_SUFFIXES for suffix in others):
+        todo = "save them as JPEG with a picture program, at their size and with their EXIF data"
     return InputDataError(
         f"{folder}: no photos" + (f", but files {', '.join(others[:6])}." if others else "."),
         "photos .jpg, .jpeg, .png, .heic or .heif.",
         f"{todo}, or with their cameras: cgwm import nerfstudio {typed_path(folder)}." if posed else f"{todo}.",
     )
+
+
+def _holds_photos(folder: Path) -> bool:
+    return any(path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for path in entries_of(folder))
 
 
 def require_distinct(photos: Iterable[Photo]) -> None:
@@ -144,7 +176,16 @@ def write_photo_capture(
 
 
 def _is_heif(path: Path) -> bool:
-    return path.suffix.lower() in HEIF_SUFFIXES
+    """Return whether a file is HEIC by its content; a text named .heic is left to the reader, which refuses it."""
+    head = _head(path)
+    if path.suffix.lower() in HEIF_SUFFIXES:
+        return not head.startswith((PNG_SIGNATURE, b"\xff\xd8"))
+    return head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS
+
+
+def _head(path: Path) -> bytes:
+    with require_regular_file(path).open("rb") as file:
+        return file.read(12)
 
 
 def _convert(source: Path, path: Path) -> None:

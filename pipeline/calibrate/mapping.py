@@ -28,6 +28,8 @@ LEAST_NOISE_PX = 0.05
 """Lower bound of that standard deviation [px]; without one, exact observations would have no scale."""
 _KEEP_WITHIN = (4.0, 3.0)
 """Residuals above this many standard deviations are taken for wrong matches, in turn, each after an adjustment."""
+_LEAST_PARALLAX = 0.002
+"""Angle between the rays of a point [rad] below which it is dropped; COLMAP triangulates none below 0.026."""
 _MEDIAN_OF_RAYLEIGH = 1.1774
 """Median length of a vector of two normal numbers with standard deviation 1: sqrt(2 ln 2)."""
 
@@ -176,7 +178,9 @@ def without_outliers(mapped: Mapped, known: Map[str, CameraIntrinsics], seed: in
     copy = pycolmap.Reconstruction(mapped.reconstruction)
     for limit in _KEEP_WITHIN:
         _drop_outliers(copy, limit)
+        _drop_undetermined(copy)
         _adjust(copy, _fixed(mapped, known), seed)
+    _drop_undetermined(copy)
     return Mapped(reconstruction=copy, names=mapped.names)
 
 
@@ -303,6 +307,16 @@ def _drop_outliers(reconstruction: Any, limit: float) -> None:
         for index in observed[lengths > most]:
             if image.points2D[index].has_point3D():  # the point may be gone with its last but one observation
                 reconstruction.delete_observation(image.image_id, int(index))
+
+
+def _drop_undetermined(reconstruction: Any) -> None:
+    """Drop points whose photos were all taken from one place, as a photo and a copy of it: they drift to infinity."""
+    centers = {key: image.projection_center() for key, image in reconstruction.images.items() if image.has_pose}
+    for key, point in list(reconstruction.points3D.items()):
+        rays = np.array([centers[element.image_id] for element in point.track.elements]) - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        if np.linalg.norm(rays - rays[0], axis=1).max() < _LEAST_PARALLAX:
+            reconstruction.delete_point3D(key)
 
 
 def _residuals(reconstruction: Any) -> list[tuple[Any, Any, Array]]:

@@ -163,6 +163,14 @@ def test_photos_are_copied_and_heic_is_converted_upright_with_its_focal_length(t
     assert kept.get_ifd(0x8769)[0xA405] == 26 and 0x0112 not in kept
 
 
+def test_a_photo_is_what_its_content_says(tmp_path: Path) -> None:
+    _photos(tmp_path / "in", ["a.jpg", "b.png"])
+    (tmp_path / "in" / "a.jpg").rename(tmp_path / "in" / "a.HEIC")  # as some phones hand photos on
+    (tmp_path / "in" / "b.png").rename(tmp_path / "in" / "b.heic")
+    import_photos(tmp_path / "in", tmp_path / "out")
+    assert Capture.open(tmp_path / "out").photos() == ["a.jpg", "b.png"]
+
+
 def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputDataError, match="DCIM: no such folder"):
         import_photos(tmp_path / "DCIM", tmp_path / "out")
@@ -276,6 +284,8 @@ def _spoil(path: Path, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
 
 
+HEIC_HEAD = b"\0\0\0\x18ftypheic" + bytes(40)
+
 REFUSED = {
     "no photos": (lambda r: (r / "in").mkdir(), import_photos, "no photos."),
     "a video in place of photos": (
@@ -283,7 +293,26 @@ REFUSED = {
         import_photos,
         "(a video: cgwm import video ",
     ),
-    "photos in a folder of it": (lambda r: (r / "in" / "images").mkdir(parents=True), import_photos, "in/images."),
+    "photos in a folder of it": (
+        lambda r: (r / "in").mkdir() or _photos(r / "in" / "day 1", ["a.jpg"]),
+        import_photos,
+        "name the folder that holds them: ",
+    ),
+    "photos to be converted": (
+        lambda r: (r / "in").mkdir() or (r / "in" / "a.webp").write_bytes(b"RIFF"),
+        import_photos,
+        "save them as JPEG",
+    ),
+    "each photo as HEIC and as JPEG": (
+        lambda r: _photos(r / "in", ["a.jpg", "b.jpg"]) or (r / "in" / "A.HEIC").write_bytes(HEIC_HEAD),
+        import_photos,
+        "1 photos are there as HEIC and as JPEG or PNG.",
+    ),
+    "HEIC under another name": (
+        lambda r: _photos(r / "in", ["a.jpg"]) or (r / "in" / "b.jpg").write_bytes(HEIC_HEAD),
+        import_photos,
+        "b.jpg: ",
+    ),
     "photos with cameras": (
         lambda r: (r / "in").mkdir() or (r / "in" / "transforms.json").write_text("{}"),
         import_photos,

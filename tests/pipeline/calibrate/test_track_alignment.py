@@ -126,3 +126,20 @@ def test_a_model_whose_photo_sees_no_point_is_known_for_it() -> None:
     last = list(model.observations)[-1]
     blind = model.observations | {last: (np.zeros((0, 2)), np.zeros(0, np.int64))}
     assert not attempts._all_seen(found.with_observations(replace(model, observations=blind)))  # pyright: ignore[reportPrivateUsage]
+
+
+def test_points_of_a_photo_and_its_copy_alone_are_dropped() -> None:
+    """Their rays are parallel but for noise: an adjustment moved them to millions of the scene's size."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 6, 80
+    found = Mapped(reconstruction=pycolmap.synthesize_dataset(options), names={1: "photos"})
+    first, copy = sorted(found.reconstruction.images.values(), key=lambda one: one.name)[:2]
+    copy.frame.rig_from_world = first.cam_from_world()
+    model, noise = found.model(), np.random.default_rng(0)
+    pixels, seen = model.observations[first.name]
+    # ten points are seen in these two alone
+    few = {name: (xy[index > 9], index[index > 9]) for name, (xy, index) in model.observations.items()}
+    both = {name: (pixels + noise.normal(0, 0.1, pixels.shape), seen) for name in (first.name, copy.name)}
+    after = without_outliers(found.with_observations(replace(model, observations={**few, **both})), {}, 0).model()
+    assert len(after.points) == len(model.points) - np.isin(np.arange(10), seen).sum() > 60
+    assert np.linalg.norm(after.points, axis=1).max() < 2 * np.linalg.norm(model.points, axis=1).max()
