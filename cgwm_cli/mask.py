@@ -29,8 +29,9 @@ def mask(
     box: Annotated[
         str | None,
         typer.Option("--box", metavar="X0,Y0,X1,Y1",
-                     help="Borders of the body in one photo [px]: left, upper, right, lower. Without it, the body is "
-                     "what stands before one colour, or turns before surroundings that stand.", show_default=False),
+                     help="Borders of the body in one photo [px], as a viewer shows it: left, upper, right, lower. "
+                     "Without it, the body is what stands before one colour, or turns before surroundings that stand.",
+                     show_default=False),
     ] = None,
     photo: Annotated[
         str | None,

@@ -1,4 +1,4 @@
-"""Which lens took a photo, from its EXIF data.
+"""Which lens took a photo, and how it is turned, from its EXIF data.
 
 EXIF is a TIFF structure in a segment APP1 of a JPEG or a chunk eXIf of a PNG (CIPA DC-008-2019, "Exif 2.32", sections
 4.5 and 4.6; PNG specification, third edition, section 11.3.4.5).
@@ -13,11 +13,14 @@ from ...schemas.regular_files import read_binary_file
 
 Value = str | float
 
-_MAKE, _MODEL, _SUBDIRECTORY = 0x010F, 0x0110, 0x8769
+_MAKE, _MODEL, _ORIENTATION, _SUBDIRECTORY = 0x010F, 0x0110, 0x0112, 0x8769
 _FOCAL_MM, _FOCAL_35_MM = 0x920A, 0xA405
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 7: 1, 9: 4, 10: 8}
 """Bytes of a value by its TIFF type."""
 _MOST_ENTRIES = 1000
+_FROM_RIGHT, _FROM_BELOW = (2, 3, 7, 8), (3, 4, 6, 7)
+"""Orientations in which the file's columns run from the right of what is shown, or its rows from below, after those of
+5 to 8 have been exchanged."""
 
 
 def photo_lens(path: Path) -> str:
@@ -29,17 +32,53 @@ def photo_lens(path: Path) -> str:
     Args:
         path: The photo, JPEG or PNG.
     """
-    block = _exif_block(read_binary_file(path))
-    try:
-        tags = {} if block is None else _tags(block)
-    except (struct.error, ValueError):
-        return ""
+    tags = _photo_tags(path)
     words = [tag for key in (_MAKE, _MODEL) if isinstance(tag := tags.get(key), str) and tag]
     for key, note in ((_FOCAL_MM, " mm"), (_FOCAL_35_MM, " mm (35 mm)")):
         length = tags.get(key)
         if isinstance(length, float) and length > 0:
             words.append(f"{length:g}{note}")
     return " ".join(words)
+
+
+def upright_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
+    """Return the width and height [px] of a photo of this size as viewers show it."""
+    return size[::-1] if _orientation(path) >= 5 else size
+
+
+def box_in_file(
+    path: Path, box: tuple[float, float, float, float], size: tuple[int, int]
+) -> tuple[float, float, float, float]:
+    """Return a box (left, upper, right, lower) [px] of an upright photo in the pixels of its file.
+
+    Args:
+        path: The photo, which viewers turn and mirror as its orientation says (CIPA DC-008-2019, section 4.6.4).
+        box: The box as a viewer shows it.
+        size: Width and height of the photo in the file [px].
+    """
+    orientation, (width, height) = _orientation(path), size
+    corners = []
+    for x, y in (box[:2], box[2:]):
+        across, down = (y, x) if orientation >= 5 else (x, y)
+        corners.append((width - across if orientation in _FROM_RIGHT else across,
+                        height - down if orientation in _FROM_BELOW else down))  # fmt: skip
+    (x0, y0), (x1, y1) = corners
+    return min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1)
+
+
+def _orientation(path: Path) -> int:
+    """Return the orientation of a photo, 1 (upright in the file) to 8; 1 where it has none."""
+    value = _photo_tags(path).get(_ORIENTATION)
+    return int(value) if isinstance(value, float) and 1 <= value <= 8 else 1
+
+
+def _photo_tags(path: Path) -> dict[int, Value]:
+    """Return the tags of a photo's EXIF data; none where they do not parse."""
+    block = _exif_block(read_binary_file(path))
+    try:
+        return {} if block is None else _tags(block)
+    except (struct.error, ValueError):
+        return {}
 
 
 def _exif_block(data: bytes) -> bytes | None:

@@ -11,14 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.capture.capture import Capture
+from ...datasets.capture.exif import box_in_file, upright_size
 from ...datasets.capture.files import entries_of
-from ...datasets.capture.images import IMAGE_SUFFIXES, image_size, read_rgb, write_image
+from ...datasets.capture.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, image_size, read_rgb, write_image
 from ...datasets.io.atomic import new_directory
 from ...datasets.io.kinds import kind_of
 from ...datasets.io.outputs import reads
 from ...datasets.io.progress import progress
 from ...schemas import CaptureManifest, InputDataError, MasksReport, NotConvergedError, UsageError, read_toml
 from ...schemas.masks import PhotoMask
+from ...schemas.printable import typed_path
 from ..foreground.graph_cut import Mask
 from .body_masks import before_plain, from_box, on_turntable
 from .doubts import doubts
@@ -62,7 +64,8 @@ def mask(
     Args:
         source: A capture, or a folder of photos.
         out: The directory to write; for a capture usually its `masks`.
-        box: Left, upper, right and lower border of the body in `photo` [px].
+        box: Left, upper, right and lower border of the body in `photo` [px], as viewers show it: turned upright as its
+            EXIF data say.
         photo: Name of the photo that `box` is about; None takes the first.
         body: Name of the body in the capture; None takes the only one.
         overwrite: Replace `out`.
@@ -79,7 +82,7 @@ def mask(
         given = _photos(Path(source), body)
         reference = _reference(given, photo)
         if box is not None:
-            _require_inside(given, reference, box)
+            box = _box_in_file(given, reference, box)
         small = [_reduced(read_rgb(given.folder / name)) for name in progress(given.names, "photos", unit="photo")]
         method, masks = _masks(given, small, reference, box)
         report = masks_report(method, given.body, given.label, given.names, masks)
@@ -101,10 +104,16 @@ def _photos(source: Path, body: str | None) -> _Photos:
     else:
         if not source.exists():
             raise InputDataError(f"{source}: no such folder.", "a folder of photos, or a capture.", "correct the path.")
+        if source.is_file():
+            raise InputDataError(
+                f"{source}: is a file.",
+                "a folder of photos, or a capture.",
+                "name the folder that holds the photos (a video: cgwm import video).",
+            )
         names = [entry.name for entry in entries_of(source) if entry.suffix.lower() in IMAGE_SUFFIXES]
         folder, bodies = source, []
     if not names:
-        raise InputDataError(f"{folder}: no photos.", "photos .jpg, .jpeg or .png.", "name the folder that holds them.")
+        raise _no_photos(folder)
     if len({Path(name).with_suffix("") for name in names}) < len(names):
         raise InputDataError(
             f"{folder}: two photos whose names differ in the suffix alone.",
@@ -112,6 +121,18 @@ def _photos(source: Path, body: str | None) -> _Photos:
             "rename one of them.",
         )
     return _Photos(folder, names, *body_of(source, bodies, body))
+
+
+def _no_photos(folder: Path) -> InputDataError:
+    """Return the error of a folder without photos that are read."""
+    unread = sorted({path.suffix for path in entries_of(folder) if path.suffix.lower() in UNREAD_SUFFIXES})
+    return InputDataError(
+        f"{folder}: no photos" + (f", but files {', '.join(unread)}." if unread else "."),
+        "photos .jpg, .jpeg or .png.",
+        f"make a capture of them first: cgwm import photos {typed_path(folder)} --out CAPTURE."
+        if unread
+        else "name the folder that holds them.",
+    )
 
 
 def body_of(source: Path, bodies: Sequence[str], body: str | None) -> tuple[str, int]:
@@ -141,8 +162,13 @@ def _reference(given: _Photos, photo: str | None) -> int:
     return given.names.index(photo)
 
 
-def _require_inside(given: _Photos, reference: int, box: Sequence[float]) -> None:
-    width, height = image_size(given.folder / given.names[reference])
+def _box_in_file(
+    given: _Photos, reference: int, box: tuple[float, float, float, float]
+) -> tuple[float, float, float, float]:
+    """Return a box that was read off an upright photo in the pixels of the photo's file."""
+    path = given.folder / given.names[reference]
+    size = image_size(path)
+    width, height = upright_size(path, size)
     left, upper, right, lower = box
     if not (0 <= left < right <= width and 0 <= upper < lower <= height):
         raise UsageError(
@@ -151,6 +177,7 @@ def _require_inside(given: _Photos, reference: int, box: Sequence[float]) -> Non
             "x0,y0,x1,y1 with x0 < x1 and y0 < y1: left, upper, right and lower border.",
             "read them off in an image viewer, with some pixels of the background all around the body.",
         )
+    return box_in_file(path, box, size)
 
 
 def _reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -173,8 +200,8 @@ def _masks(
         if masks is not None:
             return method, masks
     raise InputDataError(
-        f"{given.folder}: the photos do not tell the body: what is behind it has more than one colour, and does not "
-        "stand still.",
+        f"{given.folder}: the photos do not tell the body: none stands before one colour, and none turns before "
+        "surroundings that stand.",
         "photos before one colour, or of a turntable, or a box around the body in one photo.",
         f"--box x0,y0,x1,y1 [--photo NAME]: its borders in pixels, in {given.names[0]} unless --photo names another.",
     )

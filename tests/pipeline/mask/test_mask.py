@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from cgwm.cli.mask import _summary
+from cgwm.datasets.capture.exif import box_in_file, upright_size
 from cgwm.datasets.capture.images import read_label, write_image
 from cgwm.pipeline.mask import mask, mask_videos
 from cgwm.pipeline.mask.doubts import doubts
@@ -64,6 +66,23 @@ def test_the_body_is_cut_out(tmp_path: Path, behind: str, box: None, method: str
         assert set(np.unique(found)) == {0, 1}
         assert ((found > 0) & disc).sum() / ((found > 0) | disc).sum() > least
     assert validate(tmp_path / "masks").faults == ()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_box_is_read_off_the_upright_photo(tmp_path: Path, orientation: int) -> None:
+    image = np.zeros((40, 60, 3), np.uint8)
+    image[8:20, 30:54] = 255
+    write_image(tmp_path / "plain.jpg", image)
+    entry = struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
+    exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + entry
+    data = (tmp_path / "plain.jpg").read_bytes()
+    path = tmp_path / "turned.jpg"
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:])
+    shown = cv2.imread(str(path), cv2.IMREAD_COLOR)  # OpenCV turns a photo as viewers do
+    assert shown is not None and upright_size(path, (60, 40)) == shown.shape[1::-1]
+    y, x = np.nonzero(shown[..., 0] > 128)
+    box = (float(x.min()), float(y.min()), float(x.max() + 1), float(y.max() + 1))
+    assert box_in_file(path, box, (60, 40)) == (30, 8, 54, 20)
 
 
 def test_a_capture_gets_the_label_of_its_body(tmp_path: Path) -> None:
