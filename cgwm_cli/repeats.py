@@ -36,12 +36,14 @@ def _told(value: Any) -> Any:
 
 def _content(path: Path) -> str:
     """Return a digest of a file, or of the names and contents of the files in a directory."""
+    from ..schemas.regular_files import require_regular_file
+
     digest = hashlib.sha256()
     files = sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path]
     for file in files:
         size = file.stat().st_size
         digest.update(f"{file.relative_to(path).as_posix()}\0{size}\0".encode())
-        with file.open("rb") as stream:
+        with require_regular_file(file).open("rb") as stream:
             if size <= _WHOLE_BYTES:
                 digest.update(stream.read())
                 continue

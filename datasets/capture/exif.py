@@ -43,7 +43,8 @@ def photo_lens(path: Path) -> str:
 
 def upright_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
     """Return the width and height [px] of a photo of this size as viewers show it."""
-    return size[::-1] if _orientation(path) >= 5 else size
+    width, height = size
+    return (height, width) if _orientation(path) >= 5 else size
 
 
 def box_in_file(

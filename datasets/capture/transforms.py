@@ -116,7 +116,7 @@ def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrin
     if "w" in values and "h" in values:
         width, height = round(values["w"]), round(values["h"])
     else:
-        width, height = image_size(image)
+        width, height = image_size(image if image.exists() else image.parent / "images" / image.name)
     fx, fy = _focal_lengths(where, values, width, height)
     distortion = tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     return CameraIntrinsics.of_lens(
@@ -157,8 +157,13 @@ def _focal_lengths(where: str, values: dict[str, float], width: int, height: int
 
 def _focal(where: str, values: dict[str, float], name: str, size_px: int) -> float:
     if not 0 < values.get(name, 0.0) < math.pi:
+        found = (
+            f"'{name}' is {values[name]:g}"
+            if name in values
+            else f"neither a focal length 'fl_x' nor an angle '{name}'"
+        )
         raise InputDataError(
-            f"{where}: neither a focal length 'fl_x' nor an angle '{name}'.",
+            f"{where}: {found}.",
             "fl_x [px] above 0, or an angle of view between 0 and pi [rad].",
             _EXPORT,
         )

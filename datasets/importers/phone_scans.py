@@ -22,13 +22,13 @@ from ...schemas import CameraIntrinsics, CamerasFile, InputDataError, PosedImage
 from ...schemas.base import FileModel
 from ...schemas.imports import ImportResult
 from ..capture.camera_faults import pose_fault
-from ..capture.files import entries_of, has_folder
+from ..capture.files import entries_of, has_folder, optional_file
 from ..capture.images import decoded, image_size, write_depth
 from ..capture.transforms import matrix4, opencv_from_opengl
 from ..io.atomic import new_directory
 from ..io.outputs import reads
 from ..io.progress import progress
-from .photo_captures import Photo, copy_photos, photos_in, write_photo_capture
+from .photo_captures import Photo, copy_photos, photos_in, require_size, require_unpacked, write_photo_capture
 
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 """Turns a world whose y axis points up about x, so that z points up."""
@@ -92,9 +92,15 @@ def import_polycam(source: Path | str, out: Path | str, overwrite: bool = False)
         UsageError: If `out` exists, before anything is read.
     """
     with new_directory(out, "capture", overwrite) as directory:
-        root = Path(source)
+        root = require_unpacked(Path(source))
         root = root / "keyframes" if has_folder(root / "keyframes") else root
-        folder = next((root / name for name in ("corrected_images", "images") if has_folder(root / name)), root)
+        folder = next((root / name for name in ("corrected_images", "images") if has_folder(root / name)), None)
+        if folder is None:
+            raise InputDataError(
+                f"{root / 'images'}: no such folder: {source} is no raw export of Polycam.",
+                "keyframes/ with images/ and cameras/.",
+                "export the raw data in the app (its developer mode), and name the folder.",
+            )
         poses = root / ("corrected_cameras" if has_folder(root / "corrected_cameras") else "cameras")
         photos = photos_in(folder)
         cameras, images = {}, {}
@@ -102,7 +108,7 @@ def import_polycam(source: Path | str, out: Path | str, overwrite: bool = False)
             path = poses / f"{Path(photo.name).stem}.json"
             frame = read_json(path, _Keyframe)
             size = (frame.width, frame.height)
-            _require_size(photo, size)
+            require_size(photo, size)
             intrinsics = {"fx": frame.fx, "fy": frame.fy, "cx": frame.cx, "cy": frame.cy}
             camera = CameraIntrinsics.of_lens(str(path), width=size[0], height=size[1], **intrinsics, distortion=())
             images[photo.name] = _posed(cameras, camera, frame.pose(), str(path))
@@ -130,8 +136,14 @@ def import_record3d(source: Path | str, out: Path | str, photos: int = 60, overw
         UsageError: If `out` exists, before anything is read.
     """
     with new_directory(out, "capture", overwrite) as directory:
-        root = Path(source)
+        root = require_unpacked(Path(source))
         path = root / ("metadata" if (root / "metadata").is_file() else "metadata.json")
+        if optional_file(path) is None:
+            raise InputDataError(
+                f"{path}: no such file: {source} is no recording of Record3D.",
+                "metadata (or metadata.json) beside rgbd/ or rgb/.",
+                "export an .r3d file, unpack it, and name the folder.",
+            )
         recording = read_json(path, _Recording)
         folder = root / ("rgbd" if has_folder(root / "rgbd") else "rgb")
         frames = _numbered(photos_in(folder), len(recording.poses), path)
@@ -141,7 +153,7 @@ def import_record3d(source: Path | str, out: Path | str, photos: int = 60, overw
         cameras, images = {}, {}
         K = np.array(recording.K).reshape(3, 3).T
         for number, photo in chosen:
-            _require_size(photo, (recording.w, recording.h))
+            require_size(photo, (recording.w, recording.h))
             lens = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
             camera = CameraIntrinsics.of_lens(str(path), width=recording.w, height=recording.h, **lens, distortion=())
             pose = _pose_of(recording.poses[number], f"{path}: pose {number}")
@@ -176,16 +188,6 @@ def _pose_of(numbers: Sequence[float], where: str) -> np.ndarray:
     pose[:3, :3] = Rotation.from_quat(numbers[:4]).as_matrix()
     pose[:3, 3] = numbers[4:]
     return pose
-
-
-def _require_size(photo: Photo, size: tuple[int, int]) -> None:
-    found = image_size(photo.source)
-    if found != size:
-        raise InputDataError(
-            f"{photo.source}: {found[0]}x{found[1]} px, but its camera has {size[0]}x{size[1]} px.",
-            "photos of the size for which the camera was written.",
-            "export photos and cameras together.",
-        )
 
 
 def _numbered(photos: list[Photo], count: int, path: Path) -> list[tuple[int, Photo]]:

@@ -36,6 +36,26 @@ class Photo:
     """Its name in `images/`, with the suffix that it will have there."""
 
 
+def require_unpacked(source: Path) -> Path:
+    """Return what an importer was given; an archive, as apps of phones write them, is refused as such."""
+    if source.is_file() and _head(source).startswith(b"PK\x03\x04"):
+        raise InputDataError(
+            f"{source}: is a zip archive.", "the folder that is in it.", "unpack it, and name the folder."
+        )
+    return source
+
+
+def require_size(photo: Photo, size: tuple[int, int]) -> None:
+    """Refuse a photo whose size (width, height) [px] is not that of its camera."""
+    found = image_size(photo.source)
+    if found != size:
+        raise InputDataError(
+            f"{photo.source}: {found[0]}x{found[1]} px, but its camera has {size[0]}x{size[1]} px.",
+            "photos of the size for which the camera was written.",
+            "export photos and cameras together.",
+        )
+
+
 def photos_in(folder: Path) -> list[Photo]:
     """Return the photos of a folder, sorted by name; HEIC becomes JPEG.
 
@@ -53,22 +73,21 @@ def photos_in(folder: Path) -> list[Photo]:
 
 
 def _name_of(path: Path) -> str:
-    """Return the name of a photo in the capture: what its content says, where its suffix says HEIC."""
-    if path.suffix.lower() in HEIF_SUFFIXES and _head(path).startswith(PNG_SIGNATURE):
-        return f"{path.stem}.png"
-    return f"{path.stem}.jpg" if path.suffix.lower() in HEIF_SUFFIXES else path.name
+    """Return the name of a photo in the capture, with the suffix of its content where it is or says HEIC."""
+    if path.suffix.lower() not in HEIF_SUFFIXES and not _is_heif(path):
+        return path.name
+    return f"{path.stem}.png" if _head(path).startswith(PNG_SIGNATURE) else f"{path.stem}.jpg"
 
 
 def _refuse_both_kinds(photos: Sequence[Photo]) -> None:
     """Refuse a folder that holds photos as HEIC and, converted, as JPEG or PNG too."""
-    kinds: dict[str, set[bool]] = {}
-    for photo in photos:
-        kinds.setdefault(photo.source.stem.lower(), set()).add(photo.source.suffix.lower() in HEIF_SUFFIXES)
-    both = sum(len(kind) == 2 for kind in kinds.values())
+    converted = {photo.source.stem.lower() for photo in photos if photo.source.suffix.lower() not in HEIF_SUFFIXES}
+    both = [photo.source for photo in photos if photo.source.suffix.lower() in HEIF_SUFFIXES
+            and photo.source.stem.lower() in converted]  # fmt: skip
     if both:
-        folder = photos[0].source.parent
+        others = f", as are {len(both) - 1} others" if len(both) > 1 else ""
         raise InputDataError(
-            f"{folder}: {both} photos are there as HEIC and as JPEG or PNG.",
+            f"{both[0]}: the photo is there as JPEG or PNG, too{others}.",
             "each photo once.",
             "move one of the two kinds to another folder.",
         )
@@ -200,7 +219,7 @@ def _convert(source: Path, path: Path) -> None:
     exif = image.getexif()
     exif.pop(0x0112, None)  # the orientation: pixels are upright already
     write_image(path, pixels_of(image.convert("RGB")), _QUALITY)
-    if exif:
+    if exif and path.suffix.lower() in IMAGE_SUFFIXES[:2]:
         _insert_exif(path, exif.tobytes())
 
 

@@ -8,7 +8,7 @@ from ...schemas.imports import ImportResult
 from ..capture.files import repeated
 from ..io.atomic import new_directory
 from ..io.outputs import reads
-from .photo_captures import copy_photos, photos_in, write_photo_capture
+from .photo_captures import copy_photos, photos_in, require_unpacked, write_photo_capture
 
 
 @reads("source")
@@ -28,7 +28,7 @@ def import_photos(source: Path | str, out: Path | str, overwrite: bool = False) 
         UsageError: If `out` exists, before anything is read.
     """
     with new_directory(out, "capture", overwrite) as directory:
-        photos = photos_in(Path(source))
+        photos = photos_in(require_unpacked(Path(source)))
         again = repeated([photo.source for photo in photos])
         photos = [photo for photo in photos if photo.source not in again]
         copy_photos(directory, photos)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,15 @@ from ..capture.files import optional_file
 from ..capture.transforms import cameras_of, matrix4
 from ..io.atomic import new_directory
 from ..io.outputs import reads
-from .photo_captures import Photo, copy_photos, inside, require_distinct, write_photo_capture
+from .photo_captures import (
+    Photo,
+    copy_photos,
+    inside,
+    require_distinct,
+    require_size,
+    require_unpacked,
+    write_photo_capture,
+)
 from .recordings import LENGTHS_M, SI, Units
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")
@@ -39,7 +48,7 @@ def import_nerfstudio(source: Path | str, out: Path | str, units: Units = SI, ov
         UsageError: If `out` exists, before anything is read.
     """
     with new_directory(out, "capture", overwrite) as directory:
-        path = _transforms(Path(source))
+        path = _transforms(require_unpacked(Path(source)))
         data = parse_json(read_text_file(path), path)
         cameras = cameras_of(data, path)
         written = (path.parent / "images", path.parent)
@@ -62,8 +71,8 @@ def import_colmap(source: Path | str, out: Path | str, units: Units = SI, overwr
         InputDataError: If the model or a photo is missing or wrong.
         UsageError: If `out` exists, before anything is read.
     """
-    source = Path(source)
     with new_directory(out, "capture", overwrite) as directory:
+        source = require_unpacked(Path(source))
         model = find_colmap_model(source)
         if model is None:
             raise InputDataError(
@@ -102,6 +111,9 @@ def _write(
 ) -> ImportResult:
     photos = {name: Photo(file_of(name), inside(name)) for name in cameras.images}
     require_distinct(photos.values())
+    for name, image in cameras.images.items():
+        camera = cameras.cameras[image.camera]
+        require_size(photos[name], (camera.width, camera.height))
     copy_photos(directory, photos.values())
     named = {photos[name].name: image for name, image in cameras.images.items()}
     posed = scaled(cameras.model_copy(update={"images": named}), units, source)
@@ -119,9 +131,11 @@ def _transforms(source: Path) -> Path:
 
 
 def _found(name: str, folders: tuple[Path, ...]) -> Path:
-    for folder in folders:
-        if (path := optional_file(folder / name)) is not None:
-            return path
+    # a name with accents may be written in two ways, of which macOS has one and archives the other
+    for written in dict.fromkeys((name, unicodedata.normalize("NFC", name), unicodedata.normalize("NFD", name))):
+        for folder in folders:
+            if (path := optional_file(folder / written)) is not None:
+                return path
     raise InputDataError(
         f"the photo '{name}' is neither in {' nor in '.join(str(folder) for folder in folders)}.",
         "all photos that the cameras name.",

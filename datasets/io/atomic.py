@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ...schemas import UsageError
+from ...schemas.regular_files import require_regular_file
 from .free_space import enough_room
 from .neighbours import PARTIAL, REPLACED, alive, clean_stale, host, remove, sibling
 from .outputs import DirectoryKind, FileKind, about_to_place, inside_output, may_repeat, refuse_output, write_record
@@ -184,14 +185,18 @@ def leftovers(folder: Path, names: re.Pattern[str]) -> tuple[list[Path], list[Pa
 
 
 def sha256(path: Path | str) -> str:
-    """Return the SHA-256 (hex) of a file, or of the sorted relative names and hashes of the files in a directory."""
+    """Return the SHA-256 (hex) of a file, or of the sorted relative names and hashes of the files in a directory.
+
+    Raises:
+        InputDataError: If a file cannot be read.
+    """
     path = Path(path)
     digest = hashlib.sha256()
     if path.is_dir():
         for name in _files(path):
             digest.update(f"{name.as_posix()}\0{sha256(path / name)}\n".encode())
         return digest.hexdigest()
-    with path.open("rb") as stream:
+    with require_regular_file(path).open("rb") as stream:
         while block := stream.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()

@@ -212,6 +212,8 @@ _URDF = "elbow/elbow.urdf"
 _SCENE = "scene/transforms.json"
 _ODOMETRY, _MATRIX = "scan/odometry.csv", "scan/camera_matrix.csv"
 _NO_POSE = "1, 0, " + "0, " * 7 + "\n2, 9, "
+_HEIC = b"\0\0\0\x18ftypheic" + bytes(40)
+_ARCHIVE = b"PK\x03\x04" + bytes(60)
 _SCAN = "scan/keyframes/cameras/100.json"
 _NO_TURN = '"poses": [[0, 0, 0, 0, 1, 1, 1], ['
 _NET = "contactnets tosses --train 2 --test 1"
@@ -266,13 +268,22 @@ IMPORTS: tuple[tuple[str, str, str, Edit], ...] = (
     ("photos: a photo cut off", "phone photos", "photos photos", written("photos/a.jpg", b"\xff\xd8\xff")),
     ("photos: a text as HEIC", "phone photos", "photos photos", written("photos/c.heic", b"heic")),
     ("photos: a named pipe", "phone photos", "photos photos", kind_of("photos/b.png", "fifo")),
+    ("photos: each as HEIC and as JPEG", "phone photos", "photos photos", written("photos/a.heic", _HEIC)),
+    ("photos: HEIC as PNG", "phone photos", "photos photos", written("photos/b.png", _HEIC)),
+    ("photos: an archive", "phone photos", "photos photos.zip", written("photos.zip", _ARCHIVE)),
     ("video: a device", "walk", "video walk.mp4", kind_of("walk.mp4", "/dev/zero")),
     ("video: a playlist", "walk", "video walk.mp4", written("walk.mp4", b"#EXTM3U\n/etc/passwd\n")),
     ("nerfstudio: no pose", "nerfstudio", "nerfstudio scene", text(_SCENE, '"transform_matrix"', '"matrix"')),
     ("nerfstudio: deep nesting", "nerfstudio", "nerfstudio scene", written(_SCENE, DEEP)),
+    ("nerfstudio: an archive", "nerfstudio", "nerfstudio scene.zip", written("scene.zip", _ARCHIVE)),
+    ("nerfstudio: photos of another size", "nerfstudio", "nerfstudio scene", text(_SCENE, '"w": 64', '"w": 128')),
     ("colmap: a camera that is not there", "colmap", "colmap scene", text("scene/sparse/0/cameras.txt", "1 S", "2 S")),
     ("polycam: a focal length of 0", "polycam", "polycam scan", text(_SCAN, '"fx": 60.0', '"fx": 0')),
     ("polycam: a pose of zeros", "polycam", "polycam scan", text(_SCAN, '"t_00": ', '"t_00": 9')),
+    ("polycam: an archive", "polycam", "polycam scan.zip", written("scan.zip", _ARCHIVE)),
+    ("polycam: a recording of another", "record3d", "polycam scan", nothing),
+    ("record3d: an archive", "record3d", "record3d scan.r3d", written("scan.r3d", _ARCHIVE)),
+    ("record3d: a scan of another", "polycam", "record3d scan", nothing),
     ("record3d: a quaternion of zeros", "record3d", "record3d scan", text("scan/metadata", '"poses": [[', _NO_TURN)),
     ("record3d: K of text", "record3d", "record3d scan", text("scan/metadata", '"K": [60.0', '"K": ["60"')),
     ("arkit: a quaternion of zeros", "stray", "arkit scan", text(_ODOMETRY, "100.0, 000000, ", _NO_POSE)),

@@ -306,7 +306,7 @@ REFUSED = {
     "each photo as HEIC and as JPEG": (
         lambda r: _photos(r / "in", ["a.jpg", "b.jpg"]) or (r / "in" / "A.HEIC").write_bytes(HEIC_HEAD),
         import_photos,
-        "1 photos are there as HEIC and as JPEG or PNG.",
+        "A.HEIC: the photo is there as JPEG or PNG, too.",
     ),
     "HEIC under another name": (
         lambda r: _photos(r / "in", ["a.jpg"]) or (r / "in" / "b.jpg").write_bytes(HEIC_HEAD),
@@ -350,6 +350,17 @@ REFUSED = {
         import_polycam,
         "64x48 px, but its camera has 640x48 px.",
     ),
+    "another size beside transforms.json": (
+        lambda r: (
+            write_transforms(r / "in", ["a.png", "b.png", "c.png"])
+            or _spoil(r / "in/transforms.json", '"w": 64', '"w": 128')
+        ),
+        import_nerfstudio,
+        "64x48 px, but its camera has 128x48 px.",
+    ),
+    "an archive": (lambda r: (r / "in").write_bytes(b"PK\x03\x04"), import_record3d, "in: is a zip archive."),
+    "a scan that is none": (lambda r: (r / "in").mkdir(), import_polycam, "in is no raw export of Polycam."),
+    "a recording that is none": (lambda r: (r / "in").mkdir(), import_record3d, "in is no recording of Record3D."),
     "more frames than poses": (
         lambda r: write_record3d(r / "in") or write_image(r / "in/rgbd/7.jpg", _texture(0, WIDTH, HEIGHT)),
         import_record3d,
@@ -363,6 +374,12 @@ def _mirror(path: Path) -> None:
     for column in range(3):
         data[f"t_0{column}"] *= -1
     path.write_text(json.dumps(data))
+
+
+def test_a_name_is_found_in_the_other_way_of_writing_its_accents(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "in", ["\u00e4.png", "b.png", "c.png"])  # one letter; macOS writes two
+    (tmp_path / "in/images/\u00e4.png").rename(tmp_path / "in/images/a\u0308.png")
+    assert import_nerfstudio(tmp_path / "in", tmp_path / "out").photos == 3
 
 
 @pytest.mark.parametrize("case", REFUSED)

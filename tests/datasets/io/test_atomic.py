@@ -9,10 +9,11 @@ import time
 from pathlib import Path
 
 import pytest
+from cgwm.cli.repeats import request_of
 from cgwm.datasets import new_directory, new_file, sha256
 from cgwm.datasets.io.atomic import copy_files
 from cgwm.datasets.io.outputs import RECORD, signed
-from cgwm.schemas import UsageError
+from cgwm.schemas import InputDataError, UsageError
 
 
 def names(folder: Path) -> list[str]:
@@ -190,3 +191,11 @@ def test_a_copy_has_the_files_that_the_hash_counts(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "copy").rglob("*")) == ["a.csv", "linked", "tracks"]
     assert not (tmp_path / "copy" / "linked").is_symlink()
     assert sha256(tmp_path / "copy") == sha256(source)
+
+
+def test_a_file_that_may_not_be_read_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"a")
+    monkeypatch.setattr("os.access", lambda path, mode: False)  # root may read what it likes
+    for work in (sha256, lambda folder: request_of("mask", {"source": folder})):
+        with pytest.raises(InputDataError, match=r"a\.jpg: cannot be read: Permission denied"):
+            work(tmp_path)
