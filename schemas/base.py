@@ -85,9 +85,11 @@ def parse(data: Any, model: type[ModelT], path: Path | str, text: str = "") -> M
 
 
 def _explain(error: ValidationError, data: Any, model: type[FileModel], path: Path | str, text: str) -> InputDataError:
-    # An unknown field explains the missing one beside it ("mass" for "mass_kg"), so it is told first.
+    # A file of another kind has other fields. An unknown field explains the missing one beside it ("mass" for
+    # "mass_kg"), so it is told first.
     faults = error.errors(include_url=False)
-    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    unknown = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    fault = next((f for f in faults if f["loc"] == ("format",) and f["type"] == "literal_error"), unknown)
     location = _in_document(fault["loc"], data)
     where = find_line(text, location, Path(path).suffix)
     place = f"{path}, line {where}" if where else f"{path}"
@@ -106,7 +108,8 @@ def _explain(error: ValidationError, data: Any, model: type[FileModel], path: Pa
         fault = {**fault, "msg": _wrong_count(model, parent, data)}
     field = _field(data, location)
     message = _message(fault, location, data)
-    return InputDataError(f"{place}: {field}: {message}." if field else f"{place}: {message}.", todo=todo)
+    end = "" if message.endswith("?") else "."
+    return InputDataError(f"{place}: {field}: {message}{end}" if field else f"{place}: {message}{end}", todo=todo)
 
 
 _BOUNDS = {

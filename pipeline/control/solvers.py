@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...schemas import SolverName
+from ...schemas import SolverName, UsageError, did_you_mean
 from ..optimization.forward_mode import batched_jacobian
 from ..optimization.least_squares import Policy, descend
 from ..optimization.problem import Box, NormalEquations, Point, Problem, Rows
@@ -127,10 +127,16 @@ def solver_of(name: SolverName, sampling: Solver) -> Solver:
     Args:
         name: mppi, gauss-newton or both.
         sampling: The sampling solver.
+
+    Raises:
+        UsageError: If there is no such solver.
     """
-    if name == "gauss-newton":
-        return GaussNewton()
-    return sampling if name == "mppi" else Both(sampling)
+    known: dict[str, Solver] = {"mppi": sampling, "gauss-newton": GaussNewton(), "both": Both(sampling)}
+    if name not in known:
+        raise UsageError(
+            f"there is no solver '{name}'.", f"{', '.join(known)}.{did_you_mean(name, known)}", "name one of these."
+        )
+    return known[name]
 
 
 def descended(objective: Objective, starts: Tensor, policy: Policy) -> Solution:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -142,12 +143,13 @@ def control(
         return kept
     refuse_output(out, "run", overwrite)
     planning = planning_world(request.model, request.task)
-    with control_budget(planning, request.task, seeds, draws, out):
+    with control_budget(planning, _briefly(request.task), 1, draws, out):  # faults are told before long work
         runner = runner_of(request.model, request.task, solver, draws, request.device)
         for seed in range(seeds):
             runner.reset(seed)  # refuses what begins inside of something else
         if clock == "real":
             _require_speed(runner, request.task)
+    with control_budget(planning, request.task, seeds, draws, out):
         checkpoint = Checkpoint.beside(out, made_of, resume, overwrite, "a run")
         try:
             runs = [_run(runner, seed, clock, checkpoint, str(task)) for seed in range(seeds)]
@@ -156,6 +158,12 @@ def control(
             raise InterruptedWork(f"{checkpoint.path} holds the runs that ended; --resume goes on with them.") from None
     checkpoint.remove()
     return result
+
+
+def _briefly(task: AnyTask) -> AnyTask:
+    """Return a task that ends after the plans that are timed."""
+    brief: Any = {"success": task.success.model_copy(update={"timeout_s": TRIALS / task.planner.control_hz})}
+    return task.model_copy(update=brief)
 
 
 def _kept(out: Path, request: _Request) -> ControlResult | None:

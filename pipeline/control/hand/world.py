@@ -130,7 +130,8 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
 
     Raises:
         InputDataError: If the model has no physics, no scale, joints or several free bodies; if the file is no hand, or
-            lacks a joint or a link that the task names; or if the object begins inside of the hand.
+            lacks a joint or a link that the task names; or if the object begins inside of the hand, or is wanted inside
+            of it, out of its reach or farther away than what counts as dropped.
     """
     require_rigid(model)
     require_metric(model)
@@ -163,6 +164,7 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
     found = HandWorld(task=task, model=model, world=world, joints=moving, lower=lower, upper=upper, home=home)
     begun = found.state(task.start.position_m, task.start.quat_wxyz, dict(zip(moving, home.tolist(), strict=True)))
     require_apart(world, begun, f"{task.source}, the start")
+    _require_reach(found)
     _require_room(found)
     return found
 
@@ -208,6 +210,40 @@ def _require_servos(task: HandTask, hand: Articulation) -> None:
             "a gain above 0 for every joint.",
             "set [servo] stiffness and damping, or give the file position actuators.",
         )
+
+
+def _require_reach(found: HandWorld) -> None:
+    """Check that the object is wanted within reach, and not where it would count as dropped at the start."""
+    task, size = found.task, _size(found.world.bodies[found.object])
+    away, reach = math.dist(task.wanted_m, task.robot.position_m), _reach(found)
+    if away > reach + size:
+        raise InputDataError(
+            f"{task.source}: the object is wanted {away:.3g} m from the root of the hand: out of reach.",
+            f"up to {reach + size:.3g} m: the fingers reach {reach:.3g} m, and the object {size:.3g} m.",
+            "correct position_m of [goal], [start] or [robot].",
+        )
+    moved, dropped = math.dist(task.wanted_m, task.start.position_m), task.success.drop_m
+    if moved > dropped:
+        raise InputDataError(
+            f"{task.source}: [goal] position_m is {moved:.3g} m from where the object begins, which counts as dropped.",
+            f"up to [success] drop_m = {dropped:g} m.",
+            "correct one of them.",
+        )
+
+
+def _size(body: Body) -> float:
+    """Return the distance of the farthest point of a body from its origin [m]."""
+    return float((body.centers.norm(dim=-1) + body.radii).max()) if body.radii.numel() else 0.0
+
+
+def _reach(found: HandWorld) -> float:
+    """Return an upper bound of the distance of any point of the hand from its root, whatever its joints [m]."""
+    chain, bodies = found.chain, {body.name: body for body in found.world.bodies}
+    far = {chain.root: 0.0}
+    for joint in chain.joints:
+        ends = torch.stack((joint.lower, joint.upper)).abs() if joint.kind == "slide" else torch.zeros(1)
+        far[joint.link] = far[joint.parent] + float(joint.position.norm(dim=-1).max() + ends.max())
+    return max(far[name] + _size(bodies[name]) for name in far)
 
 
 def _require_room(found: HandWorld) -> None:

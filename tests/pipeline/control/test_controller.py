@@ -113,6 +113,8 @@ def test_worst_draws_cost_more_than_all() -> None:
 def test_wrong_arguments_are_refused() -> None:
     with pytest.raises(UsageError, match="-1 draws"):
         Controller(pushed_model(), push_task(), draws=-1)
+    with pytest.raises(UsageError, match=r"no solver 'both\+'"):
+        Controller(pushed_model(), push_task(), "both+")  # pyright: ignore[reportArgumentType]
     with pytest.raises(UsageError, match="before the first plan"):
         Controller(pushed_model(), push_task()).forecast()
 

@@ -282,6 +282,8 @@ def test_printed_tasks_are_read_again(tmp_path: Path) -> None:
         ({"robot": {"apart": ("palm",), "touching": (("tip", "palm"),)}}, "'palm' .*has no shape"),
         ({"start": {"position_m": (-0.03, 0.0, 0.035)}}, "the start: .*inside"),
         ({"goal": {"position_m": (-0.03, 0.0, 0.035)}}, "position_m: .*inside"),
+        ({"goal": {"position_m": (0.0, 0.0, 2.0)}}, "wanted 2 m from the root of the hand: out of reach"),
+        ({"success": {"drop_m": 0.001}, "goal": {"position_m": (0.0, 0.0, 0.06)}}, "which counts as dropped"),
         ({"robot": {"file": "nothing.xml"}}, r"task\.toml: \[robot\] file: .*nothing\.xml"),
         ({"limits": {"joints": {"lift": (0.2, 0.1)}}}, "a range is"),
     ],
