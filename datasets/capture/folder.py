@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import Body, CamerasFile, CaptureManifest, InputDataError, UsageError, did_you_mean
+from ...schemas import Body, CamerasFile, CaptureManifest, InputDataError, Shape, UsageError, did_you_mean
 from ...schemas.documents import shortened
 from ...schemas.printable import typed_path
 from ...schemas.regular_files import real_path, require_regular_file
@@ -88,17 +88,18 @@ class CaptureFolder:
 
     def _largest_body_m(self) -> float | None:
         """Return the diameter of the largest body whose shape the manifest or a mesh gives [m]; None without one."""
-        sizes = []
-        for body in self.manifest.bodies:
-            shape = body.shape
-            if shape is not None and shape.box is not None:
-                sizes.append(2 * math.hypot(*shape.box.half_extents_m))
-            elif shape is not None and shape.sphere is not None:
-                sizes.append(2 * shape.sphere.radius_m)
-            elif shape is not None and shape.mesh is not None:
-                corners = read_mesh(self.root / shape.mesh.path).vertices
-                sizes.append(float(np.linalg.norm(np.ptp(corners, axis=0))))
-        return max(sizes, default=None)
+        sizes = (self._diameter_m(body.shape) for body in self.manifest.bodies if body.shape is not None)
+        return max(sizes, default=0.0) or None
+
+    def _diameter_m(self, shape: Shape) -> float:
+        """Return the diameter of a body's shape [m], 0 where splats are all that is known of it."""
+        if shape.box is not None:
+            return 2 * math.hypot(*shape.box.half_extents_m)
+        if shape.sphere is not None:
+            return 2 * shape.sphere.radius_m
+        if shape.mesh is None:
+            return 0.0
+        return float(np.linalg.norm(np.ptp(read_mesh(self.root / shape.mesh.path).vertices, axis=0)))
 
     def shape_file(self, body: Body) -> Path | None:
         """Return the file of a body's mesh or splats, which must lie inside the capture; None without one."""
@@ -188,11 +189,9 @@ class CaptureFolder:
         tracks, normalised = read_tracks(path, self.body_names)
         for name, track in tracks.items():
             _require_exerted(path, self.body(name), track)
-        unturned = [name for name, track in tracks.items() if track.quat_wxyz is not None and not track.turns]
-        unturned = [name for name in unturned if self.body(name).motion == "free"]
-        for name in unturned:
-            if self._is_ball(name):
-                tracks[name] = replace(tracks[name], quat_wxyz=None)
+        unturned = [name for name, track in tracks.items() if self._is_unturned(name, track)]
+        for name in filter(self._is_ball, unturned):
+            tracks[name] = replace(tracks[name], quat_wxyz=None)
         start_s, end_s = self._window(episode)
         windowed = {name: track.window(start_s, end_s) for name, track in tracks.items()}
         for name, track in windowed.items():
@@ -240,6 +239,10 @@ class CaptureFolder:
         if len(balls) < len(bodies):
             text += "If it was not measured, leave the columns qw, qx, qy, qz out."
         return text.strip()
+
+    def _is_unturned(self, name: str, track: Track) -> bool:
+        """Return whether a body that is free to turn has the same orientation in all samples."""
+        return track.quat_wxyz is not None and not track.turns and self.body(name).motion == "free"
 
     def _is_ball(self, name: str) -> bool:
         shape = self.body(name).shape

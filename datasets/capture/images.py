@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -204,8 +204,26 @@ def _png_size(data: bytes) -> tuple[int, int]:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    offset, size = 2, None
-    while True:
+    headers, end = [], 2
+    for marker, offset, length in _jpeg_segments(data):
+        end = offset + 2 + length
+        if marker in _JPEG_FRAME_HEADERS:
+            headers.append(struct.unpack_from(">HH", data, offset + 5))
+    if len(headers) != 1:
+        raise ValueError("two image headers" if headers else "no image header")
+    if data.find(b"\xff\xd9", end) < 0:
+        raise ValueError("truncated")
+    height, width = headers[0]
+    return width, height
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield marker, place and length of each segment, up to the start of the scan.
+
+    From there on 0xFF is stuffed, so that the end marker is unmistakable.
+    """
+    offset, marker = 2, 0
+    while marker != 0xDA:
         if data[offset] != 0xFF:
             raise ValueError(f"damaged at byte {offset}")
         marker = data[offset + 1]
@@ -213,16 +231,5 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
             offset += 1 if marker == 0xFF else 2
             continue
         (length,) = struct.unpack_from(">H", data, offset + 2)
-        if marker in _JPEG_FRAME_HEADERS:
-            if size is not None:
-                raise ValueError("two image headers")
-            height, width = struct.unpack_from(">HH", data, offset + 5)
-            size = (width, height)
+        yield marker, offset, length
         offset += 2 + length
-        if marker == 0xDA:  # start of scan: from here on 0xFF is stuffed, so the end marker is unmistakable
-            break
-    if size is None:
-        raise ValueError("no image header")
-    if data.find(b"\xff\xd9", offset) < 0:
-        raise ValueError("truncated")
-    return size

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import QUATERNION_NORM_TOLERANCE, InputDataError, did_you_mean
+from ...schemas.distinct import first_repeated
 from ..io.atomic import new_file, replaced_file
 from ..io.cells import LARGEST, MOST_SHOWN, csv_rows, number_of, shown
 
@@ -127,13 +128,16 @@ def _by_body(
                 f"{path}, line {line}: {len(row)} values under {len(header)} columns.", todo="correct the line."
             )
         name = row[header.index("body")].strip()
-        if name not in by_body and name not in legal:
-            allowed = ", ".join(legal) + "." + did_you_mean(name, legal) if legal else "no body: [[bodies]] is empty."
-            raise InputDataError(
-                f"{path}, line {line}: unknown body {shown(name)}.", allowed, "correct it, or add it to capture.toml."
-            )
+        if name not in by_body:
+            _require_body(name, legal, f"{path}, line {line}")
         by_body.setdefault(name, []).append((line, row))
     return by_body
+
+
+def _require_body(name: str, legal: list[str], where: str) -> None:
+    if name not in legal:
+        allowed = ", ".join(legal) + "." + did_you_mean(name, legal) if legal else "no body: [[bodies]] is empty."
+        raise InputDataError(f"{where}: unknown body {shown(name)}.", allowed, "correct it, or add it to capture.toml.")
 
 
 def write_tracks(path: Path | str, tracks: dict[str, Track], overwrite: bool = False) -> None:
@@ -186,8 +190,9 @@ def _check_header(path: Path, header: list[str]) -> None:
             raise InputDataError(
                 f"{path}, line 1: unknown column {shown(column)}.", f"{allowed}." + did_you_mean(column, COLUMNS), todo
             )
-        if header.count(column) > 1:
-            raise InputDataError(f"{path}, line 1: the column '{column}' stands twice.", todo="remove one.")
+    twice = first_repeated(header)
+    if twice is not None:
+        raise InputDataError(f"{path}, line 1: the column '{twice}' stands twice.", todo="remove one.")
     for group in (_REQUIRED, *_OPTIONAL_GROUPS.values()):
         lacking = [column for column in group if column not in header]
         if lacking and (group is _REQUIRED or len(lacking) < len(group)):

@@ -52,6 +52,12 @@ def read_transforms(path: Path, metric: bool = False) -> CamerasFile:
     return cameras_of(parse_json(read_text_file(path), path), path, metric)
 
 
+def _file_path(where: str, frame: Any) -> str:
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        raise InputDataError(f"{where}: no 'file_path'.", "the path of its photo, a text.", _EXPORT)
+    return frame["file_path"]
+
+
 def cameras_of(data: Any, path: Path, metric: bool = False) -> CamerasFile:
     """Return the cameras of a `transforms.json` whose content is parsed; see :func:`read_transforms`."""
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
@@ -60,9 +66,7 @@ def cameras_of(data: Any, path: Path, metric: bool = False) -> CamerasFile:
     images: dict[str, PosedImage] = {}
     for k, frame in enumerate(data["frames"]):
         where = f"{path}: frames[{k}]"
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise InputDataError(f"{where}: no 'file_path'.", "the path of its photo, a text.", _EXPORT)
-        file = _image_file(path.parent, frame["file_path"])
+        file = _image_file(path.parent, _file_path(where, frame))
         intrinsics = _intrinsics(where, {**data, **frame}, path.parent / file)
         camera = next((name for name, known in cameras.items() if known == intrinsics), f"camera{len(cameras)}")
         cameras[camera] = intrinsics

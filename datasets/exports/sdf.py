@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import ArticulationModel, BodyModel, InputDataError, JointModel
+from ...schemas.distinct import first_repeated
 from ...schemas.surfaces import Surface
 from ..io.atomic import new_directory
 from ..models.model import Model
@@ -107,10 +108,10 @@ def _require_names(model: Model) -> None:
     names = [body.name for body in model.file.bodies if body.motion != "link"]
     names += [one.name for one in model.file.articulations] + [surface.name for surface in model.file.surfaces]
     names += [GROUND] if model.file.ground is not None else []
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    twice = first_repeated(names)
+    if twice is not None:
         raise InputDataError(
-            f"{model.place}: two things would be the model '{twice[0]}'.",
+            f"{model.place}: two things would be the model '{twice}'.",
             "names of bodies, jointed bodies and surfaces that differ, and none is 'ground'.",
             "rename one in the capture.",
         )
@@ -121,10 +122,10 @@ def _require_names(model: Model) -> None:
 def _require_inner_names(model: Model, one: ArticulationModel) -> None:
     """Refuse names of links and joints that SDF cannot have."""
     inside = [*one.links, *joint_names(one).values()]
-    wrong = [name for name in inside if inside.count(name) > 1] + [name for name in inside if _reserved(name)]
-    if wrong:
+    wrong = first_repeated(inside) or next(filter(_reserved, inside), None)
+    if wrong is not None:
         raise InputDataError(
-            f"{model.place}: '{wrong[0]}' of the jointed body '{one.name}' cannot be a name in SDF.",
+            f"{model.place}: '{wrong}' of the jointed body '{one.name}' cannot be a name in SDF.",
             "names of links and joints that differ; none is 'world' or begins and ends with two underscores.",
             "rename it in the URDF or MJCF of the capture.",
         )

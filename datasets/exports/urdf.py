@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import ArticulationModel, BodyModel, InputDataError, JointModel
+from ...schemas.distinct import first_repeated
 from ...schemas.surfaces import Surface
 from ..io.atomic import new_directory
 from ..models.model import Model
@@ -89,10 +90,10 @@ def robots_of(model: Model) -> list[str]:
     names = [one.name for one in model.file.articulations]
     names += [body.name for body in model.file.bodies if body.motion != "link"]
     names += ["scene"] if _has_scene(model) else []
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    twice = first_repeated(names)
+    if twice is not None:
         raise InputDataError(
-            f"{model.place}: two things would be {twice[0]}.urdf.",
+            f"{model.place}: two things would be {twice}.urdf.",
             "names of bodies and jointed bodies that differ, and none is 'scene'.",
             "rename one in the capture.",
         )

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import ArticulationModel, BodyModel, ContactParameters, InputDataError, JointModel, UsageError
+from ...schemas.distinct import first_repeated
 from ...schemas.surfaces import CylinderShape, Surface
 from ..models.model import Model
 from ..shapes.turns import quat_of_matrix, quat_of_normal, quat_product
@@ -91,7 +92,7 @@ class _Writer:
         names = [body.name for body in file.bodies] + [surface.name for surface in file.surfaces]
         names += ["ground"] if file.ground is not None else []
         prims = [prim_name(name) for name in names]
-        twice = next((prim for prim in prims if prims.count(prim) > 1), None)
+        twice = first_repeated(prims)
         if twice is not None:
             raise InputDataError(
                 f"{self.model.place}: two things would be the prim '{twice}'.",

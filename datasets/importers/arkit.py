@@ -139,8 +139,7 @@ def _lens_of_frame(video: Path, where: str, frame: NDArray[np.uint8], lens: dict
 
 def _odometry(path: Path) -> dict[int, tuple[NDArray[np.float64], dict[str, float]]]:
     """Return pose camera to world (4, 4) and own intrinsics of each frame, by its number."""
-    rows = [(line, [cell.strip() for cell in cells]) for line, cells in csv_rows(path)]
-    header = rows[0][1] if rows else []
+    (_, header), *rows = [(line, [cell.strip() for cell in cells]) for line, cells in csv_rows(path)] or [(0, [])]
     if not {"frame", *_ODOMETRY} <= set(header):
         raise InputDataError(
             f"{path}: the columns {', '.join(header[:12]) or 'none'}.",
@@ -148,8 +147,8 @@ def _odometry(path: Path) -> dict[int, tuple[NDArray[np.float64], dict[str, floa
             "export the trajectory again.",
         )
     found: dict[int, tuple[NDArray[np.float64], dict[str, float]]] = {}
-    own = [name for name in _INTRINSICS if name in header] if set(_INTRINSICS) <= set(header) else []
-    for number, cells in rows[1:]:
+    own = list(_INTRINSICS) if set(_INTRINSICS) <= set(header) else []
+    for number, cells in rows:
         if not cells:
             continue
         row = dict(zip(header, cells, strict=False))

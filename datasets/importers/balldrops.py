@@ -27,7 +27,7 @@ from ...schemas.regular_files import read_text_file
 from ..io.atomic import new_directory
 from ..io.cells import csv_rows, number_of, shown
 from ..io.outputs import reads
-from .recordings import Recording, Units, require_name, write_recordings
+from .recordings import Recording, Units, require_name, require_only, write_recordings
 
 BALL = "ball"
 _OUNCE_KG = 0.028349523125
@@ -57,10 +57,7 @@ def import_balldrops(
     with new_directory(out, "capture", overwrite) as directory:
         recordings = _drops(path)
         balls = list(dict.fromkeys(str(recording.group) for recording in recordings))
-        if only is not None and only not in balls:
-            raise InputDataError(
-                f"{path}: no ball '{only}'.", f"{', '.join(balls)}.", "pass one of these with --only, or leave it out."
-            )
+        require_only(f"{path}", "ball", only, balls)
         recordings = [recording for recording in recordings if only in (None, recording.group)]
         body = _body(path.with_name(_TABLE), balls, only)
         splits = {

@@ -131,15 +131,20 @@ def _tracks(
     text, separator = _without_comments(read_text(path))
     rows = csv_rows(path, text, separator)
     names = next((row for _, row in rows if any(cell.strip() for cell in row)), [])
-    header = replace(read_header(path, names, stated), decimal_comma=separator != ",")
-    if spin_frame is None and {QUATERNION[0], EULER[0]} & set(header.index):  # nothing says along which axes
-        header = replace(header, index={key: k for key, k in header.index.items() if key not in SPIN})
+    header = replace(_with_told_spin(read_header(path, names, stated), spin_frame), decimal_comma=separator != ",")
     left_out.update(name.strip() for k, name in enumerate(names) if k not in header.index.values())
     by_body = _samples(path, header, len(names), rows, body, renamed)
     if not by_body:
         raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
     tracks = {name: _track(f"{path}: {name}", header, np.array(values), stated) for name, values in by_body.items()}
     return {name: _with_body_spin(track) for name, track in tracks.items()} if spin_frame == "world" else tracks
+
+
+def _with_told_spin(header: Header, spin_frame: Literal["world", "body"] | None) -> Header:
+    """Return a header without the columns of spin where nothing says along which axes they are."""
+    if spin_frame is not None or not {QUATERNION[0], EULER[0]} & set(header.index):
+        return header
+    return replace(header, index={key: k for key, k in header.index.items() if key not in SPIN})
 
 
 def _track(where: str, header: Header, table: Array, stated: Conventions) -> Track:

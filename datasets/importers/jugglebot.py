@@ -31,7 +31,7 @@ from ..capture.tracks import Track
 from ..io.arrays import read_npz
 from ..io.atomic import new_directory
 from ..io.outputs import reads
-from .recordings import Recording, drawn_splits, episode_names, write_recordings
+from .recordings import Recording, drawn_splits, episode_names, require_only, write_recordings
 
 Array = NDArray[np.float64]
 
@@ -114,12 +114,14 @@ def _around_top(time: Array, position: Array) -> tuple[int, int]:
     first = next((k for k in near_top if _falls_freely(time, position, k)), -1)
     if first < 0:
         raise ValueError("nothing flies at the highest point")
-    last = first
-    while first > 0 and _falls_freely(time, position, first - 1):
-        first -= 1
-    while last < len(time) - 1 and _falls_freely(time, position, last + 1):
-        last += 1
-    return first, last
+    return _last_in_flight(time, position, first, -1), _last_in_flight(time, position, first, 1)
+
+
+def _last_in_flight(time: Array, position: Array, k: int, step: int) -> int:
+    """Return the last sample that falls freely, as all do from sample k on, in steps of 1 or -1."""
+    while 0 <= k + step < len(time) and _falls_freely(time, position, k + step):
+        k += step
+    return k
 
 
 def _falls_freely(time: Array, position: Array, k: int) -> bool:
@@ -163,17 +165,12 @@ def _throw(where: str, name: str, session: str, time: Array, position: Array) ->
 
 def _sessions(source: Path, only: str | None) -> list[Path]:
     folder = sorted(entries_of(source), key=lambda path: path.suffix) if source.is_dir() else [source]
-    files = [path for path in folder if os.path.lexists(path)]
-    by_name = {path.stem: path for path in files if path.suffix in (".json", ".npz")}  # .npz comes last and stays
+    files = [path for path in folder if path.suffix in (".json", ".npz")]
+    by_name = {path.stem: path for path in files if os.path.lexists(path)}  # .npz comes last and stays
     if not by_name:
         what = "no sessions of Jugglebot" if source.exists() else "no such file or directory"
         raise InputDataError(f"{source}: {what}.", "a session's .json or .npz, or a directory of them.", _TODO)
-    if only is not None and only not in by_name:
-        raise InputDataError(
-            f"{source}: no session '{only}'.",
-            f"{', '.join(sorted(by_name))}.",
-            "pass one of these with --only, or leave it out.",
-        )
+    require_only(f"{source}", "session", only, sorted(by_name))
     return [path for name, path in sorted(by_name.items()) if only in (None, name)]
 
 

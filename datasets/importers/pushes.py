@@ -15,7 +15,7 @@ MIT push (Yu et al., "More than a million ways to be pushed", IROS 2016): .json 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,10 +141,14 @@ def _opened(source: Path) -> Iterator[Path]:
 def _files(source: Path) -> list[Path]:
     """Return the files of a source; of a folder without any, those of its folders: MLab has one for each support."""
     inner = [path for path in entries_of(source) if path.is_dir()] if source.is_dir() else []
-    if not inner or any(path.suffix.lower() in _READERS for path in entries_of(source)):
+    found = [path for folder in inner for path in _readable(entries_of(folder))]
+    if not found or _readable(entries_of(source)):
         return track_files(source, tuple(_READERS))
-    found = [path for folder in inner for path in entries_of(folder) if path.suffix.lower() in _READERS]
-    return [require_regular_file(path) for path in found] or track_files(source, tuple(_READERS))
+    return [require_regular_file(path) for path in found]
+
+
+def _readable(files: Iterable[Path]) -> list[Path]:
+    return [path for path in files if path.suffix.lower() in _READERS]
 
 
 def _group(source: Path, file: Path) -> str:
@@ -153,13 +157,16 @@ def _group(source: Path, file: Path) -> str:
 
 
 def _chosen(files: list[Path], only: str | None) -> list[Path]:
-    chosen = [path for path in files if path.suffix.lower() in _READERS and only in (None, path.stem)]
+    readable = _readable(files)
+    if not readable:
+        raise InputDataError(f"{files[0]}: no pushes by its ending.", f"{', '.join(_READERS)}.", _TODO)
+    chosen = [path for path in readable if only in (None, path.stem)]
     if not chosen:
-        stems = sorted({path.stem for path in files if path.suffix.lower() in _READERS})
+        stems = sorted({path.stem for path in readable})
         raise InputDataError(
-            f"--only {only}: no file of this name." if stems else f"{files[0]}: no pushes by its ending.",
-            f"{', '.join(stems[:8])}.{did_you_mean(only or '', stems)}" if stems else f"{', '.join(_READERS)}.",
-            "name one of these, or leave --only out." if stems else _TODO,
+            f"--only {only}: no file of this name.",
+            f"{', '.join(stems[:8])}.{did_you_mean(only or '', stems)}",
+            "name one of these, or leave --only out.",
         )
     return chosen
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -361,22 +361,37 @@ def write_recordings(
     )
 
 
+def require_only(where: str, kind: str, only: str | None, legal: Iterable[str]) -> None:
+    """Refuse a name given with --only that none of the source has.
+
+    Raises:
+        InputDataError: If it is not among the legal ones.
+    """
+    names = list(legal)
+    if only is not None and only not in names:
+        found, todo = f"{where}: no {kind} '{only}'.", "pass one of these with --only, or leave it out."
+        raise InputDataError(found, f"{', '.join(names)}.", todo)
+
+
 def gap_warnings(recordings: Sequence[Recording]) -> tuple[str, ...]:
     """Return a warning that names the recordings whose times have gaps, with the samples that are missing in each.
 
     Samples without a pose leave gaps, and so do frames that a camera dropped.
     """
-    named = [
-        (recording.name if len(recording.tracks) == 1 else f"{recording.name} ({body})", track)
-        for recording in recordings
-        for body, track in recording.tracks.items()
-    ]
-    found = [gaps for name, track in named if (gaps := _gaps(name, track)) is not None]
+    found = [gaps for recording in recordings for gaps in _gaps_of(recording)]
     if not found:
         return ()
     worst = [words for _, words in sorted(found, key=lambda one: -one[0])[:_GAPS_NAMED]]
     more = f"; {len(found) - len(worst)} further tracks have gaps, too" if len(found) > len(worst) else ""
     return (f"samples are missing: {'; '.join(worst)}{more}. Gaps are allowed: nothing is filled in.",)
+
+
+def _gaps_of(recording: Recording) -> Iterator[tuple[int, str]]:
+    """Yield what is missing in the tracks of a recording, as `_gaps` returns it."""
+    for body, track in recording.tracks.items():
+        gaps = _gaps(recording.name if len(recording.tracks) == 1 else f"{recording.name} ({body})", track)
+        if gaps is not None:
+            yield gaps
 
 
 def _gaps(name: str, track: Track) -> tuple[int, str] | None:

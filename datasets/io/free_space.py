@@ -49,9 +49,9 @@ def full_disk(error: BaseException) -> str | None:
     if isinstance(error, OSError) and error.errno in _FULL:
         return os.strerror(error.errno)
     if isinstance(error, CgwmError):
-        known = isinstance(error, NotEnoughSpaceError) and error.__cause__ is not None
-        return full_disk(error.__cause__) if known and error.__cause__ is not None else None
-    if _WORDS.search(str(error)):
+        before = error.__cause__ if isinstance(error, NotEnoughSpaceError) else None
+    elif _WORDS.search(str(error)):
         return os.strerror(errno.ENOSPC)
-    before = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    else:
+        before = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return None if before is None else full_disk(before)

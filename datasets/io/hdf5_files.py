@@ -79,21 +79,37 @@ def own_objects(group: h5py.Group, where: str) -> Iterator[tuple[str, h5py.Group
         seen.add((info.fileno, info.addr))
         if place:
             yield place, item
-        if not isinstance(item, h5py.Group):
-            continue
-        if place.count("/") > MOST_DEEP or len(seen) + len(pending) > MOST_OBJECTS:
-            raise InputDataError(
-                f"{where}/{place[:80]}: groups without end.",
-                f"{MOST_DEEP} groups in each other.",
-                "take the original file.",
-            )
-        paths = {name: f"{place}/{name}".lstrip("/") for name in sorted(item)}
-        own = {name: is_own_link(item, name, f"{where}/{path}") for name, path in paths.items()}
-        soft += [(item, name, path) for name, path in paths.items() if not own[name]]
-        inside = [(path, item[name]) for name, path in paths.items() if own[name]]
-        pending.extend(entry for entry in reversed(inside) if isinstance(entry[1], h5py.Group | h5py.Dataset))
+        if isinstance(item, h5py.Group):
+            _require_end(place, len(seen) + len(pending), where)
+            inside, links = _entries(item, place, where)
+            pending += reversed(inside)
+            soft += links
     for parent, name, path in soft:  # last, when it is known that no path leads through a link to another file
         _require_target(parent, name, f"{where}/{path}")
+
+
+def _require_end(place: str, count: int, where: str) -> None:
+    """Refuse a group deep in others, or after very many objects: such groups hardly end."""
+    if place.count("/") > MOST_DEEP or count > MOST_OBJECTS:
+        raise InputDataError(
+            f"{where}/{place[:80]}: groups without end.",
+            f"{MOST_DEEP} groups in each other.",
+            "take the original file.",
+        )
+
+
+def _entries(
+    group: h5py.Group, place: str, where: str
+) -> tuple[list[tuple[str, h5py.Group | h5py.Dataset]], list[tuple[h5py.Group, str, str]]]:
+    """Return path and object of the groups and arrays of a group, by name, and its soft links: group, name, path."""
+    inside, soft = [], []
+    for name in sorted(group):
+        path = f"{place}/{name}".lstrip("/")
+        if not is_own_link(group, name, f"{where}/{path}"):
+            soft.append((group, name, path))
+        elif isinstance(item := group[name], h5py.Group | h5py.Dataset):
+            inside.append((path, item))
+    return inside, soft
 
 
 def is_own_link(group: h5py.Group, name: str, where: str) -> bool:
@@ -156,19 +172,24 @@ def require_stored(
         _require_sources(item, where, files or {}, depth)
         return
     chunks = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else None
-    chunk = 0 if chunks is None else math.prod(chunks) * item.dtype.itemsize
-    if chunk > MOST_CHUNK_BYTES:
-        raise InputDataError(
-            f"{where}: chunks of {chunk / 2**30:.1f} GiB.",
-            f"{MOST_CHUNK_BYTES / 2**30:g} GiB.",
-            "write the file with smaller chunks.",
-        )
+    if chunks is not None:
+        _require_small(math.prod(chunks) * item.dtype.itemsize, where)
     size, stored = math.prod(item.shape) * item.dtype.itemsize, item.id.get_storage_size()
     if size and not _is_whole(item, size, stored, chunks):
         raise InputDataError(
             f"{where}: declares {item.dtype} {item.shape}, {size / 2**20:.3g} MiB, of which {stored} bytes are stored.",
             "arrays that are written completely.",
             "take the original file.",
+        )
+
+
+def _require_small(chunk: int, where: str) -> None:
+    """Refuse chunks of very many bytes, of which one is read at a time."""
+    if chunk > MOST_CHUNK_BYTES:
+        raise InputDataError(
+            f"{where}: chunks of {chunk / 2**30:.1f} GiB.",
+            f"{MOST_CHUNK_BYTES / 2**30:g} GiB.",
+            "write the file with smaller chunks.",
         )
 
 

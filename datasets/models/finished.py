@@ -45,11 +45,10 @@ def finished_model(path: Path, wanted: Provenance, overwrite: bool) -> ModelFile
 def _differing_inputs(made: ModelFile, wanted: Provenance) -> list[str]:
     """Return the names of files whose hashes differ; those of effects are known by content, wherever the file lies."""
     sources = {effect.sha256 for effect in made.effects}
-    asked = {name: digest for name, digest in wanted.input_sha256.items() if effect_file(name) is not None}
-    found = {name: digest for name, digest in made.provenance.input_sha256.items() if effect_file(name) is None}
-    here = {name: digest for name, digest in wanted.input_sha256.items() if name not in asked}
-    files = [name for name in sorted({*found, *here}) if found.get(name) != here.get(name)]
-    return files + [name for name, digest in sorted(asked.items()) if digest not in sources]
+    found, here = made.provenance.input_sha256, wanted.input_sha256
+    effects = {name for name in {*found, *here} if effect_file(name) is not None}
+    files = [name for name in sorted({*found, *here} - effects) if found.get(name) != here.get(name)]
+    return files + [name for name in sorted(effects & set(here)) if here[name] not in sources]
 
 
 def _differing_settings(found: Any, here: Any, name: str = "") -> list[str]:

@@ -27,24 +27,25 @@ def photo_inputs(capture: Capture, config: SplatConfig) -> dict[str, str]:
     root, colmap = capture.root, find_colmap_model(capture.root)
     names = ("images", "masks", *KINDS, "capture.toml", "cameras.json", "transforms.json", POINTS_NAME)
     paths = [root / name for name in names] + ([] if colmap is None else [colmap])
-    inputs = {path.relative_to(root).as_posix(): sha256(path) for path in paths if path.exists()}
+    inputs = _hashes({path.relative_to(root).as_posix(): path for path in paths})
     return {"settings": config.model_dump_json(), "versions": json.dumps(versions()), **inputs, **_shapes(capture)}
+
+
+def _hashes(paths: Mapping[str, Path]) -> dict[str, str]:
+    """Return the SHA-256 of what is there of files and folders, by name."""
+    return {name: sha256(path) for name, path in paths.items() if path.exists()}
 
 
 def motion_inputs(capture: Capture, parent: Path | None, split: str, config: PhysConfig) -> dict[str, str]:
     """Return what the stage phys-geo is made of, by name, without the tracks; `parent`: the model that it changes."""
     made = {"physics settings": config.model_dump_json(), "split": split}
-    if parent is not None and (parent / "model.json").is_file():
-        made["parent model"] = sha256(parent / "model.json")
+    if parent is not None:
+        made |= _hashes({"parent model": parent / "model.json"})
     if config.supervise == "tracks" or split not in capture.manifest.splits:
         return made
-    for name in ("capture.toml", "cameras.json"):
-        if (capture.root / name).is_file():
-            made[name] = sha256(capture.root / name)
-    for episode in capture.episodes(split):
-        for camera in capture.videos(episode):
-            made[f"video {camera}/{episode}"] = sha256(capture.video_path(camera, episode))
-    return made
+    seen = [(camera, episode) for episode in capture.episodes(split) for camera in capture.videos(episode)]
+    videos = {f"video {camera}/{episode}": capture.video_path(camera, episode) for camera, episode in seen}
+    return made | _hashes({name: capture.root / name for name in ("capture.toml", "cameras.json")} | videos)
 
 
 def input_hashes(
@@ -66,8 +67,9 @@ def input_hashes(
     files |= {name: found[0] for name in effects if (found := effect_file(name)) is not None}
     if parent is not None:
         files["parent model"] = parent / "model.json"
-    hashes = {name: sha256(path) for name, path in files.items() if path.is_file()}
-    return hashes | {name: digest for name, digest in made_of.items() if name not in _NO_FILES} | _shapes(capture)
+    return (
+        _hashes(files) | {name: digest for name, digest in made_of.items() if name not in _NO_FILES} | _shapes(capture)
+    )
 
 
 def versions() -> dict[str, str]:
@@ -79,7 +81,7 @@ def _shapes(capture: Capture) -> dict[str, str]:
     """Return the hashes of the files of the bodies' shapes."""
     files = [file for body in capture.manifest.bodies if (file := capture.shape_file(body)) is not None]
     files += [capture.root / entry.path for entry in capture.manifest.articulations]
-    return {file.relative_to(capture.root).as_posix(): sha256(file) for file in files if file.is_file()}
+    return _hashes({file.relative_to(capture.root).as_posix(): file for file in files})
 
 
 def changed_since_fit(provenance: Provenance, capture: Capture) -> list[str]:
@@ -91,14 +93,17 @@ def changed_since_fit(provenance: Provenance, capture: Capture) -> list[str]:
         provenance: Of the model.
         capture: Where the model is applied.
     """
-    read = provenance.input_sha256
-    shared = [name for name in read if name.startswith("tracks/") or name == "cameras.json"]
-    there = [name for name in shared if (capture.root / name).is_file()]
-    same = any(read[name] == sha256(capture.root / name) for name in there[:1])
-    manifest = capture.root / "capture.toml"
-    if not same or "capture.toml" not in read or read["capture.toml"] == sha256(manifest):
+    read, manifest = provenance.input_sha256, capture.root / "capture.toml"
+    if not _is_read(read, capture) or read.get("capture.toml") in (None, sha256(manifest)):
         return []
     return [
         f"{manifest} has changed since the model was fitted: what it says of world and bodies is in the model "
         "as it was then. Fit again if one of these has changed."
     ]
+
+
+def _is_read(read: Mapping[str, str], capture: Capture) -> bool:
+    """Return whether a capture is the one of which a fit has read these files: by the first track, or the cameras."""
+    shared = [name for name in read if name.startswith("tracks/") or name == "cameras.json"]
+    there = next((name for name in shared if (capture.root / name).is_file()), None)
+    return there is not None and read[there] == sha256(capture.root / there)

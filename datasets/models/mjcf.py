@@ -319,14 +319,17 @@ def _touching(model: Model) -> Iterator[tuple[BodyModel, str, str | None, list[s
     fixed = [(one.name, one.material, _surface_geoms(one, model)) for one in file.surfaces]
     if file.ground is not None:
         fixed.append(("ground", file.ground.material, ["ground"]))
-    articulation = {link: one.name for one in file.articulations for link in one.links}
     for index, body in enumerate(file.bodies):
         for other in fixed if body.motion in MOVED else []:
             yield body, *other
         for other in file.bodies[index + 1 :]:
-            jointed = body.name in articulation and articulation[body.name] == articulation.get(other.name)
-            if (body.motion in MOVED or other.motion in MOVED) and not jointed:
+            if {body.motion, other.motion} & set(MOVED) and not _are_joined(file, {body.name, other.name}):
                 yield body, other.name, other.material, _geoms(other, model)
+
+
+def _are_joined(file: ModelFile, names: set[str]) -> bool:
+    """Return whether these are links of one jointed body."""
+    return any(names <= set(one.links) for one in file.articulations)
 
 
 def _surface_geoms(surface: Surface, model: Model) -> list[str]:

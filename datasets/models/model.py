@@ -128,14 +128,8 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
     spheres are not the visual ones, and `scene.ply`.
     """
     taken = {"scene.ply"}
-    bodies, files = [], []
-    for body in model.file.bodies:
-        visual, colliding = model.body_splats.get(body.name), model.collision.get(body.name)
-        colliding = None if colliding is visual else colliding
-        names = [_free_name(body.name, suffix, taken) for suffix in (".ply", ".collision.ply")]
-        files += [(name, splats) for name, splats in zip(names, (visual, colliding), strict=True) if splats is not None]
-        update = {"splats": names[0] if visual else None, "collision": names[1] if colliding else None}
-        bodies.append(body.model_copy(update=update))
+    files: dict[str, Splats] = {}
+    bodies = [_with_files(body, model, taken, files) for body in model.file.bodies]
     scene = None if model.scene is None else "scene.ply"
     meshes = {name: (_free_name(name, ".obj", taken), mesh) for name, mesh in model.surface_meshes.items()}
     surfaces = tuple(
@@ -143,7 +137,7 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
     )
     file = model.file.model_copy(update={"bodies": tuple(bodies), "scene": scene, "surfaces": surfaces})
     with new_directory(path, "model", overwrite) as directory:
-        for name, splats in files:
+        for name, splats in files.items():
             write_splats(directory / name, splats, "body")
         for name, mesh in meshes.values():
             (directory / name).write_text(obj_text(mesh), encoding="utf-8")
@@ -152,6 +146,17 @@ def write_model(path: Path | str, model: Model, overwrite: bool = False) -> Mode
         packed = file.model_copy(update={"effects": pack_effects(file.effects, directory)})
         (directory / "model.json").write_text(packed.model_dump_json(indent=1) + "\n", encoding="utf-8")
     return replace(model, root=Path(path), file=file)
+
+
+def _with_files(body: BodyModel, model: Model, taken: set[str], files: dict[str, Splats]) -> BodyModel:
+    """Return a body with the names of its files, and add these with their spheres to `files`."""
+    seen, collision = model.body_splats.get(body.name), model.collision.get(body.name)
+    update: dict[str, str | None] = {"splats": None, "collision": None}
+    for key, suffix, splats in (("splats", ".ply", seen), ("collision", ".collision.ply", collision)):
+        name = _free_name(body.name, suffix, taken)
+        if splats and (key == "splats" or splats is not seen):
+            files[name], update[key] = splats, name
+    return body.model_copy(update=update)
 
 
 def _write_surroundings(directory: Path, model: Model) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError
+from ...schemas.distinct import first_repeated
 from ..shapes.meshes import Mesh
 from ..shapes.turns import matrix_of, quat_of_matrix, quat_product
 
@@ -268,8 +269,8 @@ def _require_own_names(path: Path, names: list[str]) -> None:
     Raises:
         InputDataError: If two have.
     """
-    if len(set(names)) < len(names):
-        twice = next(one for one in names if names.count(one) > 1)
+    twice = first_repeated(names)
+    if twice is not None:
         raise InputDataError(
             f"{path}: several joints are called '{twice}'.", "a name of its own for each joint.", "rename one of them."
         )

@@ -262,20 +262,15 @@ def check_hashes(path: Path, manifest: DatasetManifest, files: Collection[str] |
         manifest: Its manifest.
         files: Names of the shards whose hash is compared, or None for all; for others only the size is compared.
     """
-    faults = _missing_faults(manifest)
-    promise = promise_fault(manifest)
-    faults += [] if promise is None else [promise]
-    found = (shard_fault(path / shard.file, shard, files is None or shard.file in files) for shard in manifest.shards)
-    faults += [fault for fault in found if fault is not None]
+    found = [*_missing_faults(manifest), promise_fault(manifest)]
+    found += [shard_fault(path / shard.file, shard, files is None or shard.file in files) for shard in manifest.shards]
     listed = {shard.file for shard in manifest.shards}
     if manifest.index is not None:
         listed.add(manifest.index.file)
-        fault = index_fault(path / manifest.index.file, manifest)
-        faults += [fault] if fault else []
-    extra = sorted(file.name for file in path.glob("*.h5") if file.name not in listed)
-    faults += [f"{name}: not listed in {MANIFEST}." for name in extra]
-    fault = _model_fault(path, manifest)
-    return faults if fault is None else [*faults, fault]
+        found.append(index_fault(path / manifest.index.file, manifest))
+    extra = {file.name for file in path.glob("*.h5")} - listed
+    found += [*(f"{name}: not listed in {MANIFEST}." for name in sorted(extra)), _model_fault(path, manifest)]
+    return list(filter(None, found))
 
 
 def _missing_faults(manifest: DatasetManifest) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import InputDataError
+from ...schemas.distinct import first_repeated
 from ...schemas.regular_files import read_binary_file
 from ..io.atomic import new_file
 
@@ -289,7 +290,7 @@ def _require_distinct(names: list[str]) -> None:
     """Raise ValueError for properties of which there is none, or one twice."""
     if not names:
         raise ValueError("its splats have no properties")
-    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    twice = first_repeated(names)
     if twice is not None:
         raise ValueError(f"the property '{twice}' stands twice")
 

@@ -74,9 +74,7 @@ def _toss(
         if not _is_new_and_high(qpos, solid, others):
             continue
         motion = simulate(model, qpos, qvel, -EXPOSURE_LEAD_S, duration)
-        wanted = _instructive(motion) if split == "train" else _settles(motion)
-        near = np.linalg.norm(motion.qpos[:, :2], axis=1).max() < 0.22
-        if wanted and near and stays_in_view(solid, motion, cameras):
+        if _suits(motion, split) and stays_in_view(solid, motion, cameras):
             best = min((value for value, _ in useful), default=np.inf)
             useful.append((unpredictability(rng, contact, motion, best, again), motion))
             if useful[-1][0] < _PREDICTABLE or len(useful) == _CANDIDATES:
@@ -86,6 +84,12 @@ def _toss(
             f"scene fall: none of {_TRIES} tosses of the {solid.family} stays in view.", todo="choose another seed."
         )
     return min(useful, key=lambda one: one[0])[1]
+
+
+def _suits(motion: Motion, split: str) -> bool:
+    """Return whether a toss stays near the middle and meets what its split asks for."""
+    near = np.linalg.norm(motion.qpos[:, :2], axis=1).max() < 0.22
+    return bool(near) and (_instructive(motion) if split == "train" else _settles(motion))
 
 
 def _is_new_and_high(qpos: Array, solid: SolidObject, others: Sequence[Array]) -> bool:

@@ -57,8 +57,7 @@ def simulate(mechanics: Mechanics, hidden: Sequence[Hidden], start: Start, lengt
             for touch in touches:
                 _change_contact(model, mechanics, touch, moment)
             if pushes:
-                force, torque = (np.sum(parts, axis=0) for parts in zip(*(p(moment) for p in pushes), strict=True))
-                data.xfrc_applied[1, :3], data.xfrc_applied[1, 3:] = force, torque
+                data.xfrc_applied[1] = np.sum([np.concatenate(push(moment)) for push in pushes], axis=0)
         mujoco.mj_step(model, data)
         if friction:
             friction.update(data)
