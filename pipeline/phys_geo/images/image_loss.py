@@ -63,6 +63,18 @@ class PoseModel:
 
 
 @dataclass(frozen=True, eq=False)
+class Posed:
+    """Poses (S) of all bodies (nb), and where they put the spheres that move (N)."""
+
+    position_m: Tensor
+    """Body frame origins [m], world, shape (S, nb, 3)."""
+    quat_wxyz: Tensor
+    """Orientations, shape (S, nb, 4)."""
+    means: Tensor
+    """Centres of the spheres [m], world, shape (S, N, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
 class PoseQuality:
     """Agreement of renders at poses (K) with the frames where the bodies are drawn."""
 
@@ -154,8 +166,9 @@ class ImageLoss:
         for number, video in enumerate(self.footage.videos):
             frames = self._frames(number, instants)
             for rows in _filmed(frames, _MAX_RENDERS):
-                window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach)
-                color, mask = self._residuals(number, window, position_m[rows], quat_wxyz[rows])
+                posed = self._place(position_m[rows], quat_wxyz[rows])
+                window = window_of(video, frames[rows], posed.means, self._reach)
+                color, mask = self._residuals(number, window, posed)
                 photometric = color.abs().sum((1, 2, 3)) / 3 + self._outside(number, window)
                 silhouette = mask.abs().sum((1, 2, 3)) + _mask_outside(video, window)
                 pixels = video.size[0] * video.size[1]
@@ -208,8 +221,9 @@ class ImageLoss:
         for number, video in enumerate(self.footage.videos):
             frames = self._frames(number, instants)
             for rows in _filmed(frames, _MAX_RENDERS):
-                window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach)
-                picture = self._picture(number, window, position_m[rows], quat_wxyz[rows])
+                posed = self._place(position_m[rows], quat_wxyz[rows])
+                window = window_of(video, frames[rows], posed.means, self._reach)
+                picture = self._picture(number, window, posed)
                 shown = picture[..., 3:][..., free]
                 body = shown.sum(-1)
                 error[rows] += (self._color(number, window, picture).abs().mean(-1) * body).sum((1, 2))
@@ -255,10 +269,10 @@ class ImageLoss:
         """Return loss (K,), gradient (K, D) and curvature (K, D, D) of one camera's frames at poses."""
         video, size = self.footage.videos[number], len(steps)
         count = len(frames)
-        window = window_of(video, frames, self._place(position_m, quat_wxyz), self._reach, margin=2)
         changes = torch.cat([torch.zeros(1, size).to(steps), torch.diag(steps)]).repeat_interleave(count, 0)
-        poses = self.moved(position_m.repeat(size + 1, 1, 1), quat_wxyz.repeat(size + 1, 1, 1), changes)
-        shown = _rows(*self._residuals(number, window.repeat(size + 1), *poses), blur).view(size + 1, count, -1)
+        posed = self._place(*self.moved(position_m.repeat(size + 1, 1, 1), quat_wxyz.repeat(size + 1, 1, 1), changes))
+        window = window_of(video, frames, posed.means[:count], self._reach, margin=2)  # of the poses, unchanged
+        shown = _rows(*self._residuals(number, window.repeat(size + 1), posed), blur).view(size + 1, count, -1)
         blank = _rows(*self._blank(number, window), blur)
         residual = shown[0]
         jacobian = (shown[1:] - residual) / steps[:, None, None]
@@ -268,10 +282,10 @@ class ImageLoss:
         curvature = torch.einsum("dkm,km,ekm->kde", jacobian, weight, jacobian)
         return (_huber(residual) - _huber(blank)).sum(-1) / pixels, slope, curvature
 
-    def _residuals(self, number: int, window: Window, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
+    def _residuals(self, number: int, window: Window, posed: Posed) -> tuple[Tensor, Tensor]:
         """Return colour (S, h, w, 3) and mask (S, h, w, nb, or 0 without masks) residuals in the window."""
         video = self.footage.videos[number]
-        picture = self._picture(number, window, position_m, quat_wxyz)
+        picture = self._picture(number, window, posed)
         color = self._color(number, window, picture)
         if video.covers is None:
             return color, picture[..., :0]
@@ -294,19 +308,19 @@ class ImageLoss:
         color = behind - window.cut(video.frames)
         return color, color[..., :0] if video.covers is None else -window.cut(video.covers.movedim(1, -1))
 
-    def _place(self, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
-        """Return the moving spheres' centres in the world, shape (S, N, 3)."""
+    def _place(self, position_m: Tensor, quat_wxyz: Tensor) -> Posed:
+        """Return poses with the moving spheres' centres."""
         like = self._static.means
         parts = []
         for index, spheres in self._moving:
             rotation = quat_to_matrix(quat_wxyz[:, index].to(like))
             parts.append(spheres.means @ rotation.transpose(1, 2) + position_m[:, index, None].to(like))
-        return torch.cat(parts, 1)
+        return Posed(position_m, quat_wxyz, torch.cat(parts, 1))
 
-    def _picture(self, number: int, window: Window, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
+    def _picture(self, number: int, window: Window, posed: Posed) -> Tensor:
         """Return colours and visible bodies in the window, shape (S, h, w, 3 + nb)."""
         video, drop = self.footage.videos[number], self._backdrops[number]
-        means = self._place(position_m, quat_wxyz)
+        means = posed.means
         K = video.K.repeat(len(means), 1, 1)
         K[:, :2, 2] -= window.corners.to(K)
         spheres = (means, self._scales, self._opacities, self._features)

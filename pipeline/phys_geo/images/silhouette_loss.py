@@ -19,7 +19,7 @@ from ...geometry.mesh import sample_surface
 from ...geometry.spheres import Spheres
 from .backdrop import Backdrop
 from .crops import Window, window_of
-from .image_loss import ImageLoss, PoseQuality
+from .image_loss import ImageLoss, Posed, PoseQuality
 from .silhouettes import Outline, covered
 from .video_frames import Footage, Video
 
@@ -94,8 +94,9 @@ class SilhouetteLoss(ImageLoss):
             if not len(rows):
                 continue
             covers = self._covers[number]
-            window = window_of(video, frames[rows], self._place(position_m[rows], quat_wxyz[rows]), self._reach, 2)
-            mine = self._picture(number, window, position_m[rows], quat_wxyz[rows])[..., 3:][..., free]
+            posed = self._place(position_m[rows], quat_wxyz[rows])
+            window = window_of(video, frames[rows], posed.means, self._reach, 2)
+            mine = self._picture(number, window, posed)[..., 3:][..., free]
             cover = window.cut(covers.movedim(1, -1))[..., free]
             on_edge = ((mine > EDGE[0]) & (mine < EDGE[1])) | ((cover > EDGE[0]) & (cover < EDGE[1]))
             error[rows] += (mine - cover).abs().sum((1, 2, 3))
@@ -108,9 +109,9 @@ class SilhouetteLoss(ImageLoss):
             union[rows] += (mine > 0.5).sum((1, 2, 3)) + whole - both
         return PoseQuality(inside / union, error / edges, blank / edges, area)
 
-    def _picture(self, number: int, window: Window, position_m: Tensor, quat_wxyz: Tensor) -> Tensor:
-        video = self.footage.videos[number]
-        shares = covered(video, window, self._outlines, self._count, position_m, quat_wxyz, self._step_m)
+    def _picture(self, number: int, window: Window, posed: Posed) -> Tensor:
+        video, poses = self.footage.videos[number], (posed.position_m, posed.quat_wxyz)
+        shares = covered(video, window, self._outlines, self._count, *poses, self._step_m)
         return torch.cat([shares.new_zeros(*shares.shape[:3], 3), shares], -1)
 
     def _color(self, number: int, window: Window, picture: Tensor) -> Tensor:
