@@ -230,9 +230,10 @@ def _row(entry: RankedEffect, result: DiagnoseResult) -> list[str]:
     if len(entry.parameters) > 3:
         numbers += ", ..."
     if entry.spread:
-        name, std = next(iter(entry.spread.items()))
         unit = "group" if entry.effect.endswith("@group") else "episode"
-        numbers += f"; {name} differs by {std:.2g} from {unit} to {unit}"
+        stds = ", ".join(f"{std:.2g}" for std in entry.spread.values())
+        differ = "differs" if len(entry.spread) == 1 else "differ"
+        numbers += f"; {', '.join(entry.spread)} {differ} by {stds} from {unit} to {unit}"
     return [
         entry.effect,
         ", ".join(entry.acts_in),

@@ -261,6 +261,19 @@ class VerdictThresholds:
         "its first and second harmonic",
         BY_ARGUMENT,
     )
+    own_spins: int = threshold(
+        5,
+        "episodes",
+        "fewest in which a lift by an unmeasured spin of each episode's own is named",
+        BY_ARGUMENT,
+    )
+    own_spin_gain: float = threshold(
+        2.0,
+        "1",
+        "least factor by which such a lift, fitted to the first halves of flights, lowers the errors of their second "
+        "halves, against no force and against a constant one",
+        BY_ARGUMENT,
+    )
     levelling_rad: float = threshold(
         math.radians(1.0),
         "rad",

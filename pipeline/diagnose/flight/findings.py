@@ -28,6 +28,7 @@ from ..evidence.falsification import Consistency
 from ..thresholds import THRESHOLDS
 from .omnibus import flight_windows, is_significant, worst_omnibus
 from .other_forms import OtherForms
+from .own_spin import SPIN_LIFT
 from .own_tilt import TILTS, own_tilts
 from .search import flight_search
 from .selection import FlightSelection, completed, judged, reconsidered
@@ -163,13 +164,14 @@ def flight_findings(prepared: Prepared, world: World, candidates: Sequence[Candi
             return replace(found, own_law=law)
         beside = search.beside(errors)
         found = search.findings(beside, search.selection(beside), errors, law)
-    by_group = {p.name.partition(".")[0] for p in effect_parameters(found.world) if p.shared == "group"}
+    specific = {p.name.partition(".")[0]: p.shared for p in effect_parameters(found.world) if p.shared != "all"}
+    by_group = {name for name, shared in specific.items() if shared == "group" or name == SPIN_LIFT}
     if not by_group - {active.effect.name for active in world.effects}:
         return found
     # what groups have of their own counted as slow errors of the tracks, and hid which effect it is
     own = replace(search, prepared=prepared.with_own(found.world))
     errors, law = own.told(found.world, own.errors(found.world), tilted=not by_group & set(TILTS))
-    if errors is None or not errors.noise_model.slow:
+    if SPIN_LIFT not in by_group and (errors is None or not errors.noise_model.slow):
         return found
     beside = search.beside(errors)
     return search.findings(beside, search.selection(beside), errors, law)

@@ -33,6 +33,7 @@ OWN_TILTS = ("gravity_tilt", "frame_tilt")
 FOLLOWS = {
     **dict.fromkeys(DRAGS, ("speed",)),
     "magnus_lift": ("speed", "spin"),
+    "spin_lift": ("speed",),
     "spin_damping": ("spin",),
     "ground_magnet": ("height",),
 }

@@ -24,6 +24,7 @@ from .lasting_forces import without_lasting
 from .levelling import common_tilt_p
 from .omnibus import flight_windows, is_significant, worst_omnibus
 from .other_forms import OtherForms, other_forms
+from .own_spin import with_own_spins
 from .own_tilt import OWN_TILTS, TILTS, own_tilt_step
 from .search import reselected
 
@@ -127,8 +128,20 @@ def completed(
     scatter: float,
     errors: SlowErrors | None,
 ) -> FlightSelection:
-    """Return the needed effects of a search; beside slow errors also those with a value for each episode or group."""
-    if found.flight is None or errors is None:
+    """Return the needed effects of a search, and those with a value for each episode or group."""
+    found = found if errors is None else _beside_errors(prepared, found, candidates, scatter, errors)
+    return found if found.flight is None else _with_own_spins(prepared, found, candidates, scatter)
+
+
+def _beside_errors(
+    prepared: Prepared,
+    found: FlightSelection,
+    candidates: Sequence[Candidate],
+    scatter: float,
+    errors: SlowErrors,
+) -> FlightSelection:
+    """Return the needed effects and those with a value for each episode or group."""
+    if found.flight is None:
         return found
     if errors.noise_model.slow:
         found = _with_own_tilts(prepared, found, candidates, errors)
@@ -137,6 +150,19 @@ def completed(
         return found
     grouped = with_group_values(prepared, found.steps, found.world, found.flight, candidates, scatter)
     return FlightSelection(*grouped)
+
+
+def _with_own_spins(
+    prepared: Prepared, found: FlightSelection, candidates: Sequence[Candidate], scatter: float
+) -> FlightSelection:
+    """Select a lift by a spin of each episode's own, where flights ask for it, and the other effects beside it."""
+    if found.flight is None:
+        return found
+    steps, world, flight = with_own_spins(prepared, found.steps, found.world, found.flight, candidates)
+    if world is found.world:
+        return found
+    again = reselected(prepared, steps[:-1], steps[-1:], (world, flight), candidates, scatter)
+    return FlightSelection(*again)
 
 
 def _reselected(

@@ -26,7 +26,7 @@ Values = Mapping[str, Tensor]
 """The values of an effect's parameters and constants by name, each of shape (1,) or (n,)."""
 Phase = Literal["flight", "contact", "measurement"]
 """Where an effect acts."""
-Need = Literal["ground", "drag", "contact", "spin", "orientation", "driven"]
+Need = Literal["ground", "drag", "contact", "spin", "unmeasured_spin", "orientation", "driven"]
 """Requirements of an effect, see `Effect.needs`."""
 HOOKS = ("world", "flow", "wrench", "contact", "times", "observe")
 """Methods of an effect; it overrides those that it needs."""

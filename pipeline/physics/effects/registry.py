@@ -25,6 +25,7 @@ BUILT_IN = (
     "linear_drag",
     "quadratic_drag",
     "magnus_lift",
+    "spin_lift",
     "spin_damping",
     "wind",
     "constant_force",

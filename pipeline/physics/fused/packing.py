@@ -227,6 +227,7 @@ def _structure(
         effects=effects,
         magnets=wrenches.magnets(world),
         twisted=wrenches.is_twisted(world),
+        lifted=wrenches.is_lifted(world),
         turned=turned,
         free=tuple(body.free for body in world.bodies),
         drives=(-1,) * len(world.bodies),

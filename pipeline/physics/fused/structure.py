@@ -25,7 +25,7 @@ GATHERED_THREADS = 256
 """Threads of a block that simulates one environment in which hulls of links may touch."""
 CROWDS = (256, 128, 64)
 """Largest numbers of contacts at once for which such a block has room; the first that fits into its memory."""
-BODY_COLUMNS, WRENCH_COLUMNS, TWIST_COLUMNS, MAGNET_COLUMNS, SURFACE_COLUMNS = 23, 10, 3, 2, 22
+BODY_COLUMNS, WRENCH_COLUMNS, TWIST_COLUMNS, LIFT_COLUMNS, MAGNET_COLUMNS, SURFACE_COLUMNS = 23, 10, 3, 3, 2, 22
 TURN_COLUMNS, WORLD_COLUMNS = 4, 5
 """Columns of the table of environments, by subject, as `load` in `kernels/environment.cuh` reads them; each further
 contact law adds one to those of the world."""
@@ -125,6 +125,8 @@ class Structure:
     """Number of attractions by the ground."""
     twisted: bool
     """Whether a constant angular acceleration acts."""
+    lifted: bool
+    """Whether the lift of a spin that was not measured acts."""
     turned: bool
     """Whether the frame of bodies that touch each other differs from the world frame."""
     free: tuple[bool, ...]
@@ -288,6 +290,7 @@ class Structure:
         """Number of columns of the table of environments."""
         world = WORLD_COLUMNS + self.law_count - 1 + self.turned * TURN_COLUMNS
         world += self.effects * WRENCH_COLUMNS + self.twisted * TWIST_COLUMNS + self.magnets * MAGNET_COLUMNS
+        world += self.lifted * LIFT_COLUMNS
         world += self.surface * SURFACE_COLUMNS
         if self.tree is not None:
             world += self.tree.table_width
@@ -374,7 +377,8 @@ class Structure:
             "HOST": host, "SHARED": self.shared, "SHARED_BYTES": self.shared_bytes, "SINGLE": self.single,
             "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
             "RECORD": self.record, "EFFECTS": self.effects, "MAGNETS": self.magnets,
-            "TWISTED": self.twisted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic, "TURNED": self.turned,
+            "TWISTED": self.twisted, "LIFTED": self.lifted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic,
+            "TURNED": self.turned,
             "BODIES": len(self.free), "FREES": max(1, sum(self.free)) if self.shared else len(self.free),
             "PAIRS": len(self.pairs), "FIXED": len(self.surfaces),
             "MESHES": self.surfaces.count(MESH), "MESH_CONTACTS": MESH_CONTACTS,

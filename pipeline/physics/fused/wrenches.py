@@ -22,6 +22,7 @@ from ..effects.quadratic_drag import QuadraticDrag
 from ..effects.residual_wrench import ResidualWrench
 from ..effects.rolling_resistance import RollingResistance
 from ..effects.spin_damping import SpinDamping
+from ..effects.spin_lift import SpinLift
 from ..effects.stribeck_friction import StribeckFriction
 from ..effects.torsional_friction import TorsionalFriction
 from ..effects.velocity_restitution import VelocityRestitution
@@ -34,6 +35,7 @@ _KNOWN = (
     LinearDrag,
     QuadraticDrag,
     MagnusLift,
+    SpinLift,
     SpinDamping,
     ConstantForce,
     Buoyancy,
@@ -114,6 +116,11 @@ def is_twisted(world: World) -> bool:
     return any(isinstance(active.effect, ResidualWrench) for active in world.effects)
 
 
+def is_lifted(world: World) -> bool:
+    """Return whether the lift of a spin that was not measured acts."""
+    return any(isinstance(active.effect, SpinLift) for active in world.effects)
+
+
 def has_surface(world: World) -> bool:
     """Return whether an effect changes the contact with the ground; never where bodies do not touch."""
     return world.touching and any(isinstance(active.effect, _SURFACE) for active in world.effects)
@@ -127,8 +134,9 @@ def has_ellipse(world: World) -> bool:
 def coefficients(world: World) -> list[Tensor]:
     """Return the coefficients (1 or B, k) of the effects, world frame; empty where no effect acts.
 
-    Order: c, k, s, d; f (3) with the buoyancy; wind (3); a constant angular acceleration (3) if any; A, l of each
-    attraction by the ground: a = -(c + k |u|) u + s omega x u + f - sum A exp(-height / l) n with u = v - wind, and
+    Order: c, k, s, d; f (3) with the buoyancy; wind (3); a constant angular acceleration (3) if any; the lift q (3) of
+    a spin that was not measured if any; A, l of each attraction by the ground:
+    a = -(c + k |u|) u + (s omega + q) x u + f - sum A exp(-height / l) n with u = v - wind, and
     alpha = twist - d omega. Then the coefficients of the contact, if any, in the order of `Surface` in
     `kernels/surface.cuh`.
     """
@@ -137,7 +145,7 @@ def coefficients(world: World) -> list[Tensor]:
     zero = torch.zeros_like(world.gravity[:1, :1])
     linear = quadratic = magnus = damping = zero
     still = torch.zeros_like(world.gravity[:1])
-    force, wind, twist, pulls = still, still, still, []
+    force, wind, twist, lift, pulls = still, still, still, still, []
     for active in world.effects:
         values = {name: value[:, None] for name, value in active.values.items()}
         match active.effect:
@@ -147,6 +155,8 @@ def coefficients(world: World) -> list[Tensor]:
                 quadratic = quadratic + values["k"]
             case MagnusLift():
                 magnus = magnus + values["s"]
+            case SpinLift():
+                lift = lift + vector(active.values, "q_x", "q_y", "q_z")
             case SpinDamping():
                 damping = damping + values["d"]
             case ConstantForce():
@@ -160,7 +170,8 @@ def coefficients(world: World) -> list[Tensor]:
             case ResidualWrench() as effect:
                 force = force + effect.acceleration(active.values)
                 twist = twist + effect.angular_acceleration(active.values)
-    found = [linear, quadratic, magnus, damping, force, wind, *([twist] if is_twisted(world) else []), *pulls]
+    given = [*([twist] if is_twisted(world) else []), *([lift] if is_lifted(world) else [])]
+    found = [linear, quadratic, magnus, damping, force, wind, *given, *pulls]
     return [*found, *_surface(world, zero)] if has_surface(world) else found
 
 

@@ -125,8 +125,7 @@ INLINE void add_mass(Chain& chain, const Lanes& lanes, const Configuration& at, 
 // Force and its moment about the root's origin that effects exert on a link; see `apply` for free bodies.
 INLINE Spatial pushed(const Wrenches& w, const Configuration& at, int l, const Spatial& motion) {
     Vec c = at.coms[l], omega = motion.turning, u = motion.moving + cross(omega, c) - w.wind;
-    Real drag = w.linear_drag + w.quadratic_drag * root(dot(u, u) + Real(Number(1e-24)));
-    Vec force = at.masses[l] * (w.acceleration - drag * u + w.magnus * cross(omega, u));
+    Vec force = at.masses[l] * (w.acceleration + blown(w, omega, u));
     Vec torque = -(w.spin_damping * (at.inertias[l] * omega));
 #if TWISTED
     torque = torque + at.inertias[l] * w.twist;

@@ -29,18 +29,31 @@ struct Body {
     Vec velocity, spin;  // spin: angular momentum; angular velocity where the body is not free
 };
 
-// Accelerations of the free bodies in flight: a = -(c + k |u|) u + s omega x u + f - A exp(-height / l) n with
-// u = v - wind and the height of the lowest sphere, summed over the magnets, and angular acceleration twist - d omega.
+// Accelerations of the free bodies in flight: a = -(c + k |u|) u + (s omega + q) x u + f - A exp(-height / l) n
+// with u = v - wind and the height of the lowest sphere, summed over the magnets, and alpha = twist - d omega.
 struct Wrenches {
     Real linear_drag, quadratic_drag, magnus, spin_damping;
     Vec acceleration, wind;
 #if TWISTED
     Vec twist;
 #endif
+#if LIFTED
+    Vec lift;  // q
+#endif
 #if MAGNETS
     Real magnets[MAGNETS], magnet_ranges[MAGNETS];
 #endif
 };
+
+// Acceleration by drag and lift at a velocity u in the air; the tiny number keeps the derivative finite at rest.
+INLINE Vec blown(const Wrenches& w, Vec omega, Vec u) {
+    Real drag = w.linear_drag + w.quadratic_drag * root(dot(u, u) + Real(Number(1e-24)));
+    Vec turning = w.magnus * omega;
+#if LIFTED
+    turning = turning + w.lift;
+#endif
+    return cross(turning, u) - drag * u;
+}
 
 struct Weight {
     Real inverse_mass;
@@ -179,6 +192,10 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
     at += 10;
 #if TWISTED
     w.twist = table.vector(at);
+    at += 3;
+#endif
+#if LIFTED
+    w.lift = table.vector(at);
     at += 3;
 #endif
 #if MAGNETS

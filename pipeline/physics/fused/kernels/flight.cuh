@@ -64,10 +64,7 @@ INLINE void apply(const Problem& problem, const Environment& env, const Lanes& l
     const Wrenches& w = env.wrenches;
     const Body& body = env.bodies[b];
     Real h = env.laws[0].step_s;
-    Vec u = body.velocity - w.wind;
-    // the tiny number keeps the derivative finite at rest
-    Real drag = w.linear_drag + w.quadratic_drag * root(dot(u, u) + Real(Number(1e-24)));
-    Vec a = w.acceleration - drag * u + w.magnus * cross(omega, u);
+    Vec a = w.acceleration + blown(w, omega, body.velocity - w.wind);
 #if MAGNETS
     bool pulled = false;
     for (int i = 0; i < MAGNETS; i++) pulled = pulled || !absent(w.magnets[i]);

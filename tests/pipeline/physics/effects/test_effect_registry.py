@@ -127,7 +127,7 @@ def test_wrong_files_are_refused(own: Path, tmp_path: Path) -> None:
         (
             "    phase",
             '    needs = ("luck",)\n    phase',
-            "it needs 'luck'; legal are ground, drag, contact, spin, orientation, driven",
+            "it needs 'luck'; legal are ground, drag, contact, spin, unmeasured_spin, orientation, driven",
         ),
     ],
 )

@@ -308,6 +308,13 @@ def test_magnus_lift_turns_the_path_about_the_spin() -> None:
     torch.testing.assert_close(velocity, expected, rtol=1e-3, atol=1e-3)
 
 
+def test_spin_lift_turns_the_path_whatever_spin_the_body_has() -> None:
+    """a = q x u turns the velocity about q at the rate of q, in the air: wind adds q x (u - w)."""
+    velocity, _ = in_flight(active("spin_lift", q_z=1.0), velocity=(2.0, 0.0, 0.5), omega=(3.0, 0.0, 0.0))
+    expected = batch([2 * math.cos(0.5), 2 * math.sin(0.5), 0.5])[0]
+    torch.testing.assert_close(velocity, expected, rtol=1e-3, atol=1e-3)
+
+
 def test_wind_carries_a_body_away_through_its_drag() -> None:
     wind = active("wind", w_x=2.0, w_y=-1.0)
     velocity, _ = in_flight(wind, active("linear_drag", c=20.0))

@@ -503,6 +503,7 @@ def every_effect() -> tuple[ActiveEffect, ...]:
     """Return every effect that the kernel has, one by which the items of a batch differ, and some of the world's."""
     return (
         active("linear_drag", c=[0.4, 0.1]), active("quadratic_drag", k=0.7), active("magnus_lift", s=0.2),
+        active("spin_lift", q_x=[0.3, -0.5], q_y=[-0.2, 0.1], q_z=[0.4, 0.4]),
         active("spin_damping", d=0.8), active("constant_force", f_x=0.3, f_y=-0.2, f_z=0.5), active("buoyancy", b=0.6),
         active("wind", w_x=1.0, w_y=-2.0), active("ground_magnet", A=4.0, l=0.1), active("gravity_scale", s=0.05),
         active("gravity_tilt", tilt_x=0.05, tilt_y=0.1), active("com_offset", d_x=0.003, d_y=-0.002),
@@ -571,9 +572,9 @@ def test_derivatives_of_effects(fused: Fused) -> None:
     names = [
         ("linear_drag", "c"), ("quadratic_drag", "k"), ("magnus_lift", "s"), ("spin_damping", "d"),
         ("constant_force", "f_x"), ("buoyancy", "b"), ("wind", "w_x"), ("ground_magnet", "A"), ("com_offset", "d_x"),
-        ("gravity_tilt", "tilt_x"),
+        ("gravity_tilt", "tilt_x"), ("spin_lift", "q_y"),
     ]  # fmt: skip
-    inputs = batch([0.4, 0.7, 0.2, 0.8, 0.3, 0.6, 1.0, 4.0, 0.003, 0.05, 2.0])
+    inputs = batch([0.4, 0.7, 0.2, 0.8, 0.3, 0.6, 1.0, 4.0, 0.003, 0.05, 0.4, 2.0])
     first = State(*(getattr(state, name)[:1] for name in POSES))
 
     def function(engine: Any) -> Callable[[Tensor, int], Tensor]:
