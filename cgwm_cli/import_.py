@@ -225,4 +225,23 @@ def _summary(result: ImportResult) -> str:
         return "\n".join([f"Wrote {result.capture}: {result.photos} photos {cameras}.", *warnings(result.warnings)])
     splits = ", ".join(f"{name} {count}" for name, count in result.splits.items())
     wrote = f"Wrote {result.capture}: {result.episodes} episodes ({splits}) with {result.samples} poses."
-    return "\n".join([wrote, *warnings(result.warnings)])
+    return "\n".join([wrote, *warnings(result.warnings), *_next(Path(result.capture))])
+
+
+def _next(capture: Path) -> list[str]:
+    """Return what to do with a capture of motions: give its bodies shapes, or fit it; empty where it is elsewhere."""
+    from ..schemas import CaptureManifest
+    from ..schemas.base import read_toml
+    from ..schemas.printable import typed_path
+
+    manifest = capture / "capture.toml"
+    if not manifest.is_file():
+        return []
+    fit = f"cgwm fit {typed_path(str(capture))} --out MODEL"
+    lacking = [f"'{body.name}'" for body in read_toml(manifest, CaptureManifest).bodies if body.shape is None]
+    if not lacking or (capture / "masks").is_dir():
+        return [f"Next: {fit}"]
+    return [
+        f"Next: give {' and '.join(lacking)} a shape in {manifest}, below the name, for example "
+        f"shape = {{ sphere = {{ radius_m = 0.02 }} }}; then {fit}"
+    ]

@@ -97,6 +97,15 @@ def test_import() -> None:
     assert import_._summary(result) == "Wrote out: 400 episodes (train 50, test 100) with 41869 poses."
 
 
+def test_import_says_which_body_lacks_a_shape(tmp_path: Path) -> None:
+    (tmp_path / "capture.toml").write_text('format = "cgwm-capture/1"\n[[bodies]]\nname = "ball"\n')
+    result = ImportResult(capture=str(tmp_path), episodes=1, samples=9, splits={"train": 1})
+    assert "Next: give 'ball' a shape in" in import_._summary(result)
+    with (tmp_path / "capture.toml").open("a") as manifest:
+        manifest.write("shape = { sphere = { radius_m = 0.02 } }\n")
+    assert import_._summary(result).endswith(f"Next: cgwm fit {tmp_path} --out MODEL")
+
+
 def test_validate() -> None:
     report = ValidationReport(
         path="c", kind="capture", facts={"splits": {"train": 2}, "reprojection_px": 0.61234}, faults=("a.", "b.")
