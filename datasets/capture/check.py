@@ -183,7 +183,13 @@ def _check_names(capture: CaptureFolder) -> None:
         named += [(f"[episodes] names '{name}'", name) for name in manifest.episodes]
     for words, name in named:
         _require_among(found, "episodes", name, f"{path}: {words}, which has neither track nor video.", todo)
-    for name in manifest.video.camera_time_offset_s:
+    _check_offsets(capture)
+
+
+def _check_offsets(capture: CaptureFolder) -> None:
+    """Check that the cameras whose offsets of time the manifest names exist on disk."""
+    path = capture.root / "capture.toml"
+    for name in capture.manifest.video.camera_time_offset_s:
         _require_among(
             capture.video_cameras(),
             "cameras",

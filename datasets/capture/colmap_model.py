@@ -78,13 +78,8 @@ def read_colmap_model(folder: Path, metric: bool = False) -> CamerasFile:
     binary = all(optional_file(folder / f"{name}.bin") for name in ("cameras", "images"))
     suffix = ".bin" if binary else ".txt"
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
-    cameras: dict[str, CameraIntrinsics] = {}
+    cameras = _read_cameras(camera_path, binary)
     images: dict[str, PosedImage] = {}
-    with _faults(camera_path) as place:
-        for number, model, width, height, params in (_cameras_bin if binary else _cameras_txt)(place):
-            if not all(map(math.isfinite, params)):
-                raise ValueError(f"camera {number} has parameters that are not finite: {params}")
-            cameras[f"camera{number}"] = _intrinsics(f"{place}", number, model, width, height, params)
     with _faults(image_path) as place:
         for name, camera, quat_wxyz, translation in (_images_bin if binary else _images_txt)(place):
             if f"camera{camera}" not in cameras:
@@ -93,6 +88,17 @@ def read_colmap_model(folder: Path, metric: bool = False) -> CamerasFile:
             images[name.removeprefix("images/")] = PosedImage(camera=f"camera{camera}", T_world_cam=pose)
     scale = Scale(kind="metric" if metric else "unscaled", source="COLMAP model")
     return CamerasFile(scale=scale, cameras=cameras, images=images)
+
+
+def _read_cameras(path: Path, binary: bool) -> dict[str, CameraIntrinsics]:
+    """Return the cameras of a file by name."""
+    cameras: dict[str, CameraIntrinsics] = {}
+    with _faults(path) as place:
+        for number, model, width, height, params in (_cameras_bin if binary else _cameras_txt)(place):
+            if not all(map(math.isfinite, params)):
+                raise ValueError(f"camera {number} has parameters that are not finite: {params}")
+            cameras[f"camera{number}"] = _intrinsics(f"{place}", number, model, width, height, params)
+    return cameras
 
 
 def _pose(name: str, quat_wxyz: Sequence[float], translation: Sequence[float]) -> Matrix4:

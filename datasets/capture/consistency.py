@@ -258,10 +258,9 @@ def _corrections(manifest: CaptureManifest, motions: Sequence[TrackedMotion]) ->
     ground = manifest.world.ground
     yield from unit_corrections()
     gravity = np.array(manifest.world.gravity_m_s2)
-    for correction in frame_corrections(gravity, None if ground is None else np.array(ground.normal)):
-        # A ground that holds nothing explains nothing.
-        if ground is None or _presses(manifest, correction):
-            yield correction
+    frames = frame_corrections(gravity, None if ground is None else np.array(ground.normal))
+    # A ground that holds nothing explains nothing.
+    yield from (one for one in frames if ground is None or _presses(manifest, one))
     gaps = [gap for motion in motions if (gap := clearance(manifest, motion, AS_WRITTEN)) is not None]
     if ground is not None and gaps:
         lowest = float(np.median([np.quantile(gap, 0.02) for gap in gaps]))
@@ -277,12 +276,13 @@ def _better_order(manifest: CaptureManifest, motions: Sequence[TrackedMotion]) -
     written = float((_depths(manifest, seen, AS_WRITTEN) > LYING_SHARE).mean())
     if written < LYING_FRAMES:
         return None
-    for correction in ORDERS:
-        corrected = _depths(manifest, seen, correction)
-        lies = (np.abs(corrected) < LYING_TIGHT).mean() >= LYING_FRAMES
-        if lies and (corrected > LYING_SHARE).mean() <= written / 10:
-            return correction
-    return None
+    return next((one for one in ORDERS if _lies(_depths(manifest, seen, one), written)), None)
+
+
+def _lies(depths: Array, written: float) -> bool:
+    """Return whether bodies lie on the ground by these depths, and far fewer reach into it than as written."""
+    tight, deep = (np.abs(depths) < LYING_TIGHT).mean(), (depths > LYING_SHARE).mean()
+    return bool(tight >= LYING_FRAMES and deep <= written / 10)
 
 
 def _depths(manifest: CaptureManifest, motions: Sequence[TrackedMotion], correction: Correction) -> Array:
@@ -393,10 +393,7 @@ def _warnings(manifest: CaptureManifest, motions: Sequence[TrackedMotion], where
         deep, touches, _ = _contact(manifest, motion, AS_WRITTEN)
         free = ~touches & ~deep & (motion.windows.std_error <= MEASURED_SHARE / 4 * max(strength, 1e-12))
         flights.append(motion.windows.acceleration[free])
-        gap = clearance(manifest, motion, AS_WRITTEN)
-        if gap is not None and motion.outline is not None:
-            limit = MEASURED_SHARE * motion.outline.size_m + 4 * motion.windows.noise
-            under.append(float((gap < -limit).mean()))
+        under += _share_under(manifest, motion)
     measured = np.concatenate(flights)
     if strength and len(measured) >= FEWEST:
         yield from _other_fall(measured, gravity, where)
@@ -405,6 +402,15 @@ def _warnings(manifest: CaptureManifest, motions: Sequence[TrackedMotion], where
             f"{where}: in {100 * np.mean(under):.0f} % of the frames a body is under the ground by more than "
             f"{MEASURED_SHARE:.0%} of its size. Candidates: the ground's height or tilt, the shape, the tracked point."
         )
+
+
+def _share_under(manifest: CaptureManifest, motion: TrackedMotion) -> list[float]:
+    """Return the share of frames in which a body is under the ground; nothing of one without an outline."""
+    gap = clearance(manifest, motion, AS_WRITTEN)
+    if gap is None or motion.outline is None:
+        return []
+    limit = MEASURED_SHARE * motion.outline.size_m + 4 * motion.windows.noise
+    return [float((gap < -limit).mean())]
 
 
 def _other_fall(measured: Array, gravity: Array, where: str) -> Iterator[str]:

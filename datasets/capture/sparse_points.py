@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -66,9 +67,9 @@ def _table(path: Path, data: bytes) -> NDArray[Any]:
     """Return the points of a file, as they are stored."""
     header, found, body = data.partition(b"end_header\n")
     lines = header.decode("ascii", "replace").splitlines()
-    counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
+    counts = re.findall(r"^element vertex (\d+)$", "\n".join(lines), re.MULTILINE | re.ASCII)
     properties = [line for line in lines if line.startswith("property")]
-    if not found or len(counts) != 1 or not counts[0].isdigit() or properties != _PROPERTIES:
+    if not found or len(counts) != 1 or properties != _PROPERTIES:
         raise InputDataError(
             f"{path}: not the sparse points of a calibration.", todo="run 'cgwm calibrate --overwrite'."
         )

@@ -97,14 +97,17 @@ def tracked_motions(capture: CaptureFolder) -> list[TrackedMotion]:
     chosen = np.unique(np.linspace(0, len(episodes) - 1, min(count, len(episodes))).round().astype(int))
     motions = []
     for name in (episodes[k] for k in chosen):
-        try:
-            tracks = capture.tracks(name)
-        except InputDataError:
-            continue  # a fault of its own
-        for body in free:
-            if body.name in tracks and len(tracks[body.name]) >= 5:
-                motions.append(_motion(capture, name, body, tracks, outlines))
+        tracks = _sound_tracks(capture, name)
+        long = [body for body in free if body.name in tracks and len(tracks[body.name]) >= 5]
+        motions += [_motion(capture, name, body, tracks, outlines) for body in long]
     return motions
+
+
+def _sound_tracks(capture: CaptureFolder, episode: str) -> dict[str, Track]:
+    try:
+        return capture.tracks(episode)
+    except InputDataError:
+        return {}  # a fault of its own
 
 
 def _motion(

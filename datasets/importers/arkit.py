@@ -151,11 +151,15 @@ def _odometry(path: Path) -> dict[int, tuple[NDArray[np.float64], dict[str, floa
     for number, cells in rows:
         if not cells:
             continue
-        row = dict(zip(header, cells, strict=False))
-        values = _numbers([row.get(name, "") for name in ("frame", *_ODOMETRY, *own)], f"{path}: line {number}")
-        pose = _pose(values[4:8], values[1:4], f"{path}: line {number}")
-        found[int(values[0])] = pose, dict(zip(own, values[8:], strict=True))
+        frame, pose, lens = _frame(dict(zip(header, cells, strict=False)), own, f"{path}: line {number}")
+        found[frame] = pose, lens
     return found
+
+
+def _frame(row: dict[str, str], own: Sequence[str], where: str) -> tuple[int, NDArray[np.float64], dict[str, float]]:
+    """Return the number of a frame, its pose and the intrinsics that it has of its `own`."""
+    values = _numbers([row.get(name, "") for name in ("frame", *_ODOMETRY, *own)], where)
+    return int(values[0]), _pose(values[4:8], values[1:4], where), dict(zip(own, values[8:], strict=True))
 
 
 def _matrix(path: Path) -> dict[str, float]:

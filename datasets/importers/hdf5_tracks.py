@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -100,13 +100,18 @@ def _episodes(path: Path, columns: Mapping[str, str], units: Units) -> list[tupl
             if (track := _track(path, group, columns, units)) is not None:
                 tracks.append((str(group.name).strip("/").replace("/", "-") or path.stem, track))
     if not tracks:
-        shown = ", ".join(seen[:8]) + (", ..." if len(seen) > 8 else "")
-        raise InputDataError(
-            f"{path}: no group with times and positions; there are {shown or 'no sets'}.",
-            "groups with 'time' (T,), 'position' (T, 3) and, where measured, 'quat_wxyz' or 'quat_xyzw' (T, 4).",
-            "name them: --columns time=NAME,position=NAME,quat_wxyz=NAME.",
-        )
+        raise _no_tracks(path, seen)
     return tracks
+
+
+def _no_tracks(path: Path, seen: Sequence[str]) -> InputDataError:
+    """Return the error of a file without tracks, in which these sets were seen."""
+    shown = ", ".join(seen[:8]) + (", ..." if len(seen) > 8 else "")
+    return InputDataError(
+        f"{path}: no group with times and positions; there are {shown or 'no sets'}.",
+        "groups with 'time' (T,), 'position' (T, 3) and, where measured, 'quat_wxyz' or 'quat_xyzw' (T, 4).",
+        "name them: --columns time=NAME,position=NAME,quat_wxyz=NAME.",
+    )
 
 
 def _track(path: Path, group: h5py.Group, columns: Mapping[str, str], units: Units) -> Track | None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -220,7 +221,7 @@ def write_obj(path: Path, mesh: Mesh) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _recordings(source: Path, n_train: int) -> list[_Recording]:
+def _push_files(source: Path) -> list[Path]:
     folders = [folder for folder in entries_of(source / "dataset") if folder.is_dir()]
     files = [path for folder in folders for path in entries_of(folder) if path.match("dynamic_*.json")]
     if not files:
@@ -228,13 +229,17 @@ def _recordings(source: Path, n_train: int) -> list[_Recording]:
         raise InputDataError(
             f"{source}: {what}.", "a directory with dataset/<push>/dynamic_train0.json, and envs/.", _TODO
         )
+    return files
+
+
+def _recordings(source: Path, n_train: int) -> list[_Recording]:
+    files = _push_files(source)
+    in_folder = Counter(file.parent for file in files)
     recordings = []
     for file in files:
         push = read_json(file, _Push)
-        frames = _frames(file, push)
-        several = len([other for other in files if other.parent == file.parent]) > 1
-        name = f"{file.parent.name}-{file.stem}" if several else file.parent.name
-        recordings.append(_Recording(name, push, file.parent, frames))
+        name = file.parent.name if in_folder[file.parent] == 1 else f"{file.parent.name}-{file.stem}"
+        recordings.append(_Recording(name, push, file.parent, _frames(file, push)))
     _require_enough_frames(source, recordings, n_train)
     return recordings
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -80,14 +81,19 @@ def _bags(source: Path) -> list[Path]:
     entries = entries_of(source) if source.is_dir() else []
     bags = [source] if there and _is_bag(source) else [path for path in entries if _is_bag(path)]
     if not bags:
-        messages = next((path for path in entries if path.suffix == ".db3"), None)
-        what = f"no ROS bags{f', but {messages} without metadata.yaml' if messages else ''}"
-        raise InputDataError(
-            f"{source}: {what if there else 'no such file or directory'}.",
-            "a .bag, a .mcap, a directory with metadata.yaml, or a folder of them.",
-            "name the bag's .mcap or .bag file, or its folder.",
-        )
+        raise _no_bags(source, entries)
     return bags
+
+
+def _no_bags(source: Path, entries: Sequence[Path]) -> InputDataError:
+    """Return the error of a source without a bag, in which these entries were found."""
+    messages = next((path for path in entries if path.suffix == ".db3"), None)
+    what = f"no ROS bags{f', but {messages} without metadata.yaml' if messages else ''}"
+    return InputDataError(
+        f"{source}: {what if os.path.lexists(source) else 'no such file or directory'}.",
+        "a .bag, a .mcap, a directory with metadata.yaml, or a folder of them.",
+        "name the bag's .mcap or .bag file, or its folder.",
+    )
 
 
 def _is_bag(path: Path) -> bool:
@@ -161,9 +167,7 @@ def _poses(reader: Any, topic: str, frame: str) -> Iterator[list[float]]:
         for one in message.transforms if connection.msgtype == TRANSFORMS else (message,):
             if frame and one.child_frame_id != frame:
                 continue
-            pose = one
-            for part in POSES.get(connection.msgtype, "transform").split("."):
-                pose = getattr(pose, part)
+            pose = attrgetter(POSES.get(connection.msgtype, "transform"))(one)
             stamp = one.header.stamp
             yield [float(stamp.sec * 1_000_000_000 + stamp.nanosec), *_pose(pose)]
 

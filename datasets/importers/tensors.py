@@ -51,6 +51,11 @@ def _require_tensor(file: Path, tensor: Any, columns: int, batched: bool) -> Non
             f"a tensor {wanted}.",
             todo="save each toss as one tensor of this shape with torch.save.",
         )
+    _require_numbers(file, tensor)
+
+
+def _require_numbers(file: Path, tensor: Any) -> None:
+    """Refuse very many numbers, or complex ones."""
     if tensor.numel() > MOST_NUMBERS or tensor.is_complex():  # a tensor may repeat few numbers without end
         found = f"{file}: {tensor.numel()} numbers, {tensor.dtype}."
         raise InputDataError(

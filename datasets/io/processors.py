@@ -30,11 +30,15 @@ def processor_limits() -> Mapping[str, int]:
     quotas = [max(1, int(quota)) for quota in _quotas()]
     if quotas:
         limits["the quota of its control group"] = min(quotas)
+    return limits | dict(_stated_limits())
+
+
+def _stated_limits() -> Iterator[tuple[str, int]]:
+    """Yield the environment variables that limit the processors, and their numbers."""
     for name in ("OMP_NUM_THREADS", "SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
         first = os.environ.get(name, "").split(",")[0].split("(")[0]
         if first.isdecimal() and int(first) > 0:
-            limits[name] = int(first)
-    return limits
+            yield name, int(first)
 
 
 def use_few_threads() -> None:

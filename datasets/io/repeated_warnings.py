@@ -34,13 +34,14 @@ def _folded(same: Sequence[str]) -> str:
     names = list(dict.fromkeys(match[2] for match in found))
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     rests = [message[match.end() :] for message, match in zip(same, found, strict=True)]
-    columns = iter(list(zip(*(_NUMBER.findall(rest) for rest in rests), strict=True)))
-
-    def spread(_: re.Match[str]) -> str:
-        least, most = (choose(column, key=float) for column in [next(columns)] for choose in (min, max))
-        return least if float(least) == float(most) else f"{least} to {most}"
-
-    rest = _NUMBER.sub(spread, rests[0])
+    ranges = map(_range, zip(*(_NUMBER.findall(rest) for rest in rests), strict=True))
+    rest = _NUMBER.sub(lambda _: next(ranges), rests[0])
     if len(names) == 1:
         return found[0][0] + rest
     return f"{len(names)} {found[0][1]}s ({', '.join(names[:SHOWN])}{more}) {_PLURAL[found[0][3]]} {rest}"
+
+
+def _range(numbers: Sequence[str]) -> str:
+    """Return the smallest and the largest of some numbers as a text, one of them where they are equal."""
+    least, most = min(numbers, key=float), max(numbers, key=float)
+    return least if float(least) == float(most) else f"{least} to {most}"

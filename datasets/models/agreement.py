@@ -86,6 +86,16 @@ def _require_pairs(file: ModelFile, path: Path) -> None:
 
 def _values(file: ModelFile) -> Iterator[tuple[str, float, str]]:
     """Yield the names of parameters, their values in the model, and the places of those."""
+    yield from _contact_values(file)
+    for body in file.bodies:
+        yield f"{body.name}.mass_kg", body.mass_kg, f"mass_kg of body '{body.name}'"
+        for axis, value in zip("xyz", body.com_m, strict=True):
+            yield f"{body.name}.com_{axis}_m", value, f"com_m of body '{body.name}' along {axis}"
+    yield from _effect_values(file)
+
+
+def _contact_values(file: ModelFile) -> Iterator[tuple[str, float, str]]:
+    """Yield those of the contact law, and of the laws of pairs of materials."""
     if file.contact is not None:
         for name in type(file.contact).model_fields:
             yield name, getattr(file.contact, name), f"contact.{name}"
@@ -93,10 +103,10 @@ def _values(file: ModelFile) -> Iterator[tuple[str, float, str]]:
         for name in ContactParameters.model_fields:
             place = f"{name} of the pair {' and '.join(entry.materials)}"
             yield of_pair(name, entry.materials), getattr(entry, name), place
-    for body in file.bodies:
-        yield f"{body.name}.mass_kg", body.mass_kg, f"mass_kg of body '{body.name}'"
-        for axis, value in zip("xyz", body.com_m, strict=True):
-            yield f"{body.name}.com_{axis}_m", value, f"com_m of body '{body.name}' along {axis}"
+
+
+def _effect_values(file: ModelFile) -> Iterator[tuple[str, float, str]]:
+    """Yield those of the effects whose parameters the library names."""
     for effect in file.effects:
         name = effect.name.partition("@")[0]
         if ":" in name:

@@ -100,12 +100,7 @@ def write_mjcf(
     root = ET.Element("mujoco", model="cgwm")
     _add_options(root, model)
     world = ET.SubElement(root, "worldbody")
-    if file.ground is not None:
-        normal = np.asarray(file.ground.normal)
-        place = {"pos": _text(normal * file.ground.offset_m), "zaxis": _text(normal)}
-        ET.SubElement(world, "geom", name="ground", type="plane", size="0 0 1").attrib.update(place)
-    for surface in file.surfaces:
-        _add_surface(root, world, surface, model)
+    _add_surroundings(root, world, model)
     for body in file.bodies:
         if body.motion != "link":
             pose = body.photo_pose
@@ -122,6 +117,17 @@ def write_mjcf(
         ET.SubElement(ET.SubElement(root, "custom"), "text", name="source", data=source)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_surroundings(root: ET.Element, world: ET.Element, model: Model) -> None:
+    """Add what is fixed: the ground, and the other surfaces."""
+    ground = model.file.ground
+    if ground is not None:
+        normal = np.asarray(ground.normal)
+        place = {"pos": _text(normal * ground.offset_m), "zaxis": _text(normal)}
+        ET.SubElement(world, "geom", name="ground", type="plane", size="0 0 1").attrib.update(place)
+    for surface in model.file.surfaces:
+        _add_surface(root, world, surface, model)
 
 
 def mujoco_states(

@@ -141,12 +141,7 @@ class Articulation:
             InputDataError: If they are not one tree.
         """
         carrier = _carriers(path, links, joints)
-        root = _root(path, [link for link in links if link not in carrier])
-        order, placed = [root], []
-        for link in order:
-            below = [joint for joint in joints if joint.parent == link]
-            placed += below
-            order += [joint.link for joint in below]
+        order, placed = _from_root(_root(path, [link for link in links if link not in carrier]), joints)
         _require_all(path, links, order)
         _require_own_names(path, [joint.name for joint in placed])
         for joint in placed:
@@ -261,6 +256,16 @@ def _root(path: Path, roots: list[str]) -> str:
         found = "no link is the root: the joints are a ring" if not roots else f"several roots: {', '.join(roots)}"
         raise InputDataError(f"{path}: {found}.", "one tree of links.", "join the links, or leave out the others.")
     return roots[0]
+
+
+def _from_root(root: str, joints: Sequence[JointOfRobot]) -> tuple[list[str], list[JointOfRobot]]:
+    """Return the links that a root carries, itself first, and the joints in the order of the others."""
+    order, placed = [root], []
+    for link in order:
+        below = [joint for joint in joints if joint.parent == link]
+        placed += below
+        order += [joint.link for joint in below]
+    return order, placed
 
 
 def _require_own_names(path: Path, names: list[str]) -> None:

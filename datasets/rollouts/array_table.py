@@ -378,12 +378,15 @@ def table_rows() -> list[str]:
     return rows + [f"| {' | '.join(_cells(entry))} |" for entry in entries]
 
 
+def _fixed(text: str, other: str) -> str:
+    """Return a unit or a frame, the other text where it depends on the array, and nothing for "-"."""
+    return other if "{" in text else {"-": ""}.get(text, text)
+
+
 def _cells(entry: ArrayEntry) -> tuple[str, ...]:
     """Return the cells of an array's row: place, shape and type, unit and frame, values, and what it is."""
     place = entry.name.replace("{", "<").replace("}", ">")
-    unit = "varies" if "{" in entry.unit else entry.unit
-    frame = "image" if "{" in entry.frame else entry.frame
     what = " ".join(text for text in (entry.text, entry.note) if text and not text.startswith("{"))
     shape = f"{entry.axes} {' or '.join(entry.dtype.split())}"
-    units = ", ".join(text for text in (unit, frame) if text != "-") or "-"
+    units = ", ".join(filter(None, (_fixed(entry.unit, "varies"), _fixed(entry.frame, "image")))) or "-"
     return f"`{place}`", shape, units, entry.values_text or "-", what.replace(" ({turning})", "")

@@ -173,17 +173,14 @@ def _number(name: str) -> int:
 
 
 def _read(path: Path, name: str, demo: Node, robot: Literal["finger", "hand"], names: tuple[str, ...]) -> RunTables:
-    arrays, table_of_commands = {}, _commands_of(robot)
+    table_of_commands = _commands_of(robot)
     if _number(name) < 0:
         raise InputDataError(
             f"{path}: data/{name}: no run.",
             "groups demo_<seed> in data.",
             "name a file of runs that 'cgwm control' wrote.",
         )
-    for key in (*table_of_commands, *PLANS):
-        if key not in demo or not isinstance(demo[key], h5py.Dataset):
-            raise InputDataError(f"{path}: data/{name} lacks the array '{key}'.", todo="take the original file.")
-        arrays[key] = demo[key][()]
+    arrays = {key: _stored(f"{path}: data/{name}", demo, key) for key in (*table_of_commands, *PLANS)}
     sizes = {"N": arrays["plans/times"].shape[-1] if arrays["plans/times"].ndim > 1 else 0}
     sizes |= {"J": len(names), "S": 14 + 2 * len(names)}
     for table, rows in ((table_of_commands, len(arrays["actions"])), (PLANS, len(arrays["plans/cost"]))):
@@ -192,6 +189,12 @@ def _read(path: Path, name: str, demo: Node, robot: Literal["finger", "hand"], n
             _require_shape(f"{path}: data/{name}/{key}", arrays[key].shape, wanted)
     ended = str(demo.attrs.get("ended", ""))
     return RunTables(seed=_number(name), ended=ended, arrays=arrays, robot=robot, joints=names)
+
+
+def _stored(where: str, demo: Node, key: str) -> Any:
+    if key not in demo or not isinstance(demo[key], h5py.Dataset):
+        raise InputDataError(f"{where} lacks the array '{key}'.", todo="take the original file.")
+    return demo[key][()]
 
 
 def _require_shape(where: str, found: tuple[int, ...], wanted: tuple[Any, ...]) -> None:

@@ -231,7 +231,7 @@ class RolloutDataset:
         names = there if cameras is None else list(cameras)
         _require_cameras(names, there)
         wanted = ["bodies/pos", "bodies/quat_wxyz", "obs/{camera}_image"] if keys is None else keys
-        every = [key.replace("{camera}", name) for key in wanted for name in (names if "{camera}" in key else [""])]
+        every = [name for key in wanted for name in _of_cameras(key, names)]
         for key in every if len(self.reader) else []:  # before workers start
             self.reader.read(0, key, 0, 1)
             _require_frames(key, str(self.reader.group(0)[key].attrs["shape_meaning"]))
@@ -250,6 +250,11 @@ class RolloutDataset:
         item["rollout"] = np.int64(self.reader.rollouts[number].index)
         item["start"] = np.int64(start)
         return item
+
+
+def _of_cameras(key: str, cameras: Sequence[str]) -> list[str]:
+    """Return the arrays that a key names: for "{camera}" one of each camera."""
+    return [key.replace("{camera}", name) for name in cameras] if "{camera}" in key else [key]
 
 
 def _list(handle: Node, file: Path, split: str | None) -> Iterable[RolloutInfo]:

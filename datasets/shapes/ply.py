@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -201,6 +201,11 @@ def _finite_columns(path: Path, columns: dict[str, Array]) -> dict[str, NDArray[
     return table
 
 
+def _stacked(columns: Mapping[str, Array], names: Sequence[str]) -> Array:
+    """Return some columns side by side, shape (N, len(names))."""
+    return np.stack([np.asarray(columns[name], np.float64) for name in names], axis=1)
+
+
 def _harmonics(path: Path, columns: dict[str, Array]) -> Array | None:
     """Return the harmonics from degree 1 on (N, K, 3), or None where there are none or all are zero."""
     count = sum(name.startswith("f_rest_") for name in columns)
@@ -212,7 +217,7 @@ def _harmonics(path: Path, columns: dict[str, Array]) -> Array | None:
             "9, 24 or 45 of them, of degree 1, 2 or 3.",
             "export the splats with all harmonics of a degree.",
         )
-    values = np.stack([np.asarray(columns[f"f_rest_{k}"], np.float64) for k in range(count)], axis=1)
+    values = _stacked(columns, [f"f_rest_{k}" for k in range(count)])
     if not np.isfinite(values).all():
         bad = int((~np.isfinite(values)).any(1).sum())
         raise InputDataError(f"{path}: 'f_rest_*' is not finite in {bad} splats.", "finite numbers.", _REMOVE)
@@ -223,7 +228,7 @@ def _unit_normals(columns: dict[str, Array]) -> Array | None:
     """Return the normals (N, 3), or None if the file has none: other programs write zeros."""
     if any(name not in columns for name in ("nx", "ny", "nz")):
         return None
-    normals = np.stack([np.asarray(columns[name], np.float64) for name in ("nx", "ny", "nz")], axis=1)
+    normals = _stacked(columns, ("nx", "ny", "nz"))
     length = np.linalg.norm(normals, axis=1)
     if not (np.isfinite(length) & (length > 1e-6)).all():
         return None
