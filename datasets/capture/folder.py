@@ -227,7 +227,7 @@ class CaptureFolder:
         Args:
             episodes: The `unturned` bodies of each episode.
         """
-        bodies = sorted({name for names in episodes.values() for name in names})
+        bodies = sorted(set().union(*episodes.values()))
         if not bodies:
             return ""
         places = [name for name, names in episodes.items() if names]

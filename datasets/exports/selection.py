@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,15 +128,8 @@ class Selection:
             block = self.reader.window(number, start, min(READ_FRAMES, last - start), keys)
             amodal = self._amodal(number, camera, start, min(start + READ_FRAMES, last)) if labels else None
             for frame in wanted:
-                image, *others = (block[key][frame - start] for key in keys)
-                depth, mask = others or (np.zeros((0, 0), np.float32), np.zeros((0, 0), np.uint8))
-                yield Picture(
-                    frame=frame,
-                    image=image,
-                    depth_m=depth,
-                    mask=mask,
-                    amodal=None if amodal is None else amodal[frame - start],
-                )
+                seen = [block[key][frame - start] for key in keys]
+                yield _picture(frame, seen, None if amodal is None else amodal[frame - start])
 
     def _amodal(self, number: int, camera: str, start: int, stop: int) -> NDArray[np.bool_] | None:
         """Return the amodal masks of a chunk, shape (n, B, H, W); bit k of a pixel belongs to body k."""
@@ -161,3 +155,10 @@ def _require_cameras(path: Path, there: Sequence[str], wanted: Sequence[str]) ->
                 ", ".join(there),
                 "name one of these with --cameras.",
             )
+
+
+def _picture(frame: int, seen: Sequence[NDArray[Any]], amodal: NDArray[np.bool_] | None) -> Picture:
+    """Return a frame with its image, and depth and mask where these were read, too."""
+    image, *others = seen
+    depth, mask = others or (np.zeros((0, 0), np.float32), np.zeros((0, 0), np.uint8))
+    return Picture(frame=frame, image=image, depth_m=depth, mask=mask, amodal=amodal)

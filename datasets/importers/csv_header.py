@@ -60,11 +60,16 @@ class Conventions:
 
     def check(self) -> None:
         """Raise UsageError if they contradict each other or cannot be."""
-        rate, order = self.frame_rate_hz, self.euler
+        rate = self.frame_rate_hz
         if rate is not None and not 1e-3 <= rate <= 1e6:
             raise UsageError(f"--frame-rate {rate:g}.", "0.001 to 1000000 frames a second.", "correct it.")
         if rate is not None and self.units.time is not None:
             raise UsageError("--frame-rate with --time-unit.", "one of the two.", "leave one out.")
+        self._check_angles()
+
+    def _check_angles(self) -> None:
+        """Raise UsageError for an unknown order of turns, or a unit of angles that are not read."""
+        order = self.euler
         if order is not None and order not in EULER_ORDERS:
             allowed = "xyz, zyx, ... about fixed axes; XYZ, ZYX, ... about those of the body, first turn first."
             raise UsageError(f"--euler {shown(order)}.", allowed, "roll, pitch, yaw of robots: --euler xyz.")
@@ -218,7 +223,7 @@ def _place(path: Path, names: list[str], key: str, stated: Conventions) -> int |
         return _stated_place(path, names, key, stated.columns[key])
     hits = [k for k, name in enumerate(names) if _quantity(name, key) in _NAMES[key]]
     if key == "time" and stated.frame_rate_hz is not None:
-        hits = [k for k, name in enumerate(names) if _plain(name)[0] in _FRAMES] or hits
+        hits = _frame_counts(names) or hits
     if len(hits) > 1:
         raise InputDataError(
             f"{path}: '{names[hits[0]]}' and '{names[hits[1]]}' may both be '{key}'.",
@@ -226,6 +231,11 @@ def _place(path: Path, names: list[str], key: str, stated: Conventions) -> int |
             f"choose: --columns {key}=NAME.",
         )
     return hits[0] if hits else None
+
+
+def _frame_counts(names: list[str]) -> list[int]:
+    """Return the indices of the columns that count frames by their names."""
+    return [k for k, name in enumerate(names) if _plain(name)[0] in _FRAMES]
 
 
 def _stated_place(path: Path, names: list[str], key: str, name: str) -> int:

@@ -180,14 +180,19 @@ def _read_npz(path: Path) -> list[tuple[Array, Array]]:
     numbers = all(array.dtype.kind in "iuf" for array in found.values())
     offsets, rows = (found["offsets"], found["txyz"]) if numbers else (np.zeros(0), np.zeros((0, 0)))
     offsets, rows = offsets.astype(np.int64), rows.astype(np.float64)
-    sound = rows.ndim == 2 and rows.shape[1] == 4 and offsets.ndim == 1 and len(offsets) > 1
-    if not sound or offsets[0] != 0 or offsets[-1] != len(rows) or (np.diff(offsets) <= 0).any():
+    if rows.ndim != 2 or rows.shape[1] != 4 or not _cuts(offsets, len(rows)):
         raise InputDataError(
             f"{path}: 'txyz' has the shape {rows.shape}, 'offsets' {offsets.shape}.",
             "(rows, 4), and offsets that grow from 0 to the number of rows.",
             _TODO,
         )
     return [(rows[a:b, 0], rows[a:b, 1:]) for a, b in pairwise(offsets.tolist())]
+
+
+def _cuts(offsets: NDArray[np.int64], count: int) -> bool:
+    """Return whether offsets grow from 0 to a number of rows."""
+    grows = offsets.ndim == 1 and len(offsets) > 1 and (np.diff(offsets) > 0).all()
+    return bool(grows) and offsets[0] == 0 and offsets[-1] == count
 
 
 def _read_json(path: Path) -> list[tuple[Array, Array]]:

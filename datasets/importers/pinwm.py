@@ -151,19 +151,23 @@ def import_pinwm(source: Path | str, out: Path | str, n_train: int = 12, overwri
         write_manifest(directory / "capture.toml", manifest)
         (directory / "cameras.json").write_text(_cameras(filmed).model_dump_json(indent=1) + "\n", encoding="utf-8")
         (directory / "tracks").mkdir()
-        samples = 0
-        for name, recording in [*train.items(), *((recording.name, recording) for recording in recordings)]:
-            count = n_train if name in train else len(recording.push.pose_datas)
-            tracks = {body: track.window(0.0, (count - 0.5) / RATE_HZ) for body, track in recording.tracks.items()}
-            (directory / "tracks" / f"{name}.csv").write_text(tracks_csv(tracks), encoding="utf-8")
-            samples += sum(map(len, tracks.values()))
-            _write_frames(directory, name, recording, recording.frames[:count])
+        samples = sum(_write_episode(directory, name, recording, n_train) for name, recording in train.items())
+        for recording in recordings:
+            samples += _write_episode(directory, recording.name, recording, len(recording.push.pose_datas))
     return ImportResult(
         capture=str(out),
         episodes=len(train) + len(recordings),
         samples=samples,
         splits={name: len(episodes) for name, episodes in manifest.splits.items()},
     )
+
+
+def _write_episode(directory: Path, name: str, recording: _Recording, count: int) -> int:
+    """Write tracks and pictures of the first frames of a recording; return the number of samples."""
+    tracks = {body: track.window(0.0, (count - 0.5) / RATE_HZ) for body, track in recording.tracks.items()}
+    (directory / "tracks" / f"{name}.csv").write_text(tracks_csv(tracks), encoding="utf-8")
+    _write_frames(directory, name, recording, recording.frames[:count])
+    return sum(map(len, tracks.values()))
 
 
 def _bodies(source: Path, directory: Path) -> tuple[Body, Body]:
