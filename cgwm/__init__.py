@@ -6,6 +6,8 @@ stage is first used, so that importing :mod:`cgwm` costs milliseconds.
 
 from __future__ import annotations
 
+from importlib import import_module
+
 TYPE_CHECKING = False  # as in typing: the command imports nothing that takes time before it handles signals
 
 _PUBLIC = {
@@ -17,8 +19,8 @@ _PUBLIC = {
     "ControlPlan": ".pipeline.control",
     "ControlState": ".pipeline.control",
     "Controller": ".pipeline.control",
-    "HandController": ".pipeline.control",
     "DamagedShardError": ".schemas",
+    "HandController": ".pipeline.control",
     "InputDataError": ".schemas",
     "Model": ".datasets.models",
     "NotConvergedError": ".schemas",
@@ -26,11 +28,12 @@ _PUBLIC = {
     "NotEnoughSpaceError": ".schemas",
     "PhysConfig": ".schemas",
     "Reach": ".pipeline.control",
-    "Targets": ".pipeline.control",
     "SplatConfig": ".schemas",
     "SynthesizeConfig": ".schemas",
+    "Targets": ".pipeline.control",
     "UsageError": ".schemas",
     "Velocity": ".pipeline.control",
+    "__version__": ".version",
     "calibrate": ".pipeline.calibrate",
     "compare": ".pipeline.compare",
     "control": ".pipeline.control",
@@ -40,23 +43,23 @@ _PUBLIC = {
     "export": ".pipeline.export",
     "fit": ".pipeline.fit",
     "import_arkit": ".datasets.importers.arkit",
-    "import_realsense": ".datasets.importers.realsense",
     "import_balldrops": ".datasets.importers.balldrops",
+    "import_colmap": ".datasets.importers.posed_photos",
     "import_contactnets": ".datasets.importers.contactnets",
-    "import_elbow": ".datasets.importers.elbow",
     "import_csv": ".datasets.importers.csv_tracks",
+    "import_elbow": ".datasets.importers.elbow",
     "import_hdf5": ".datasets.importers.hdf5_tracks",
     "import_jugglebot": ".datasets.importers.jugglebot",
-    "import_pushes": ".datasets.importers.pushes",
+    "import_nerfstudio": ".datasets.importers.posed_photos",
+    "import_photos": ".datasets.importers.photo_folder",
     "import_pinwm": ".datasets.importers.pinwm",
+    "import_polycam": ".datasets.importers.phone_scans",
+    "import_pushes": ".datasets.importers.pushes",
+    "import_realsense": ".datasets.importers.realsense",
+    "import_record3d": ".datasets.importers.phone_scans",
     "import_rosbag": ".datasets.importers.rosbag",
     "import_tum": ".datasets.importers.tum",
-    "import_record3d": ".datasets.importers.phone_scans",
-    "import_polycam": ".datasets.importers.phone_scans",
-    "import_nerfstudio": ".datasets.importers.posed_photos",
-    "import_colmap": ".datasets.importers.posed_photos",
     "import_video": ".datasets.importers.walk_video",
-    "import_photos": ".datasets.importers.photo_folder",
     "improve": ".pipeline.improve",
     "mask": ".pipeline.mask",
     "merge": ".pipeline.synthesize",
@@ -209,21 +212,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import a public name on first use."""
     if name in _PUBLIC:
-        from importlib import import_module
-
         return getattr(import_module(_PUBLIC[name], __name__), name)
-    if name == "__version__":
-        return _version()
     raise AttributeError(f"module 'cgwm' has no attribute {name!r}")
-
-
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version  # a fifth of the time of `cgwm --help`
-
-    try:
-        return version("cgwm")
-    except PackageNotFoundError:  # a source tree that was never installed
-        return "0.0.0"
 
 
 def __dir__() -> list[str]:

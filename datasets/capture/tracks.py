@@ -151,11 +151,7 @@ def tracks_csv(tracks: dict[str, Track]) -> str:
 
     Columns that no track has are omitted; a track that lacks columns of another one leaves them empty.
     """
-    groups = {
-        name: columns
-        for name, columns in _OPTIONAL_GROUPS.items()
-        if any(getattr(track, name) is not None for track in tracks.values())
-    }
+    groups = _measured_groups(tracks.values())
     rows: list[tuple[float, int, list[str]]] = []
     for order, (body, track) in enumerate(tracks.items()):
         for k in range(len(track)):
@@ -163,6 +159,13 @@ def tracks_csv(tracks: dict[str, Track]) -> str:
     rows.sort(key=lambda entry: entry[:2])
     header = [*_REQUIRED, *(column for columns in groups.values() for column in columns)]
     return "".join(",".join(row) + "\n" for row in [header, *(row for _, _, row in rows)])
+
+
+def _measured_groups(tracks: Iterable[Track]) -> dict[str, Sequence[str]]:
+    """Return the optional groups of columns that some track has."""
+    every = list(tracks)
+    there = {name for name in _OPTIONAL_GROUPS for track in every if getattr(track, name) is not None}
+    return {name: columns for name, columns in _OPTIONAL_GROUPS.items() if name in there}
 
 
 def _row(body: str, track: Track, k: int, groups: Mapping[str, Sequence[str]]) -> list[str]:

@@ -308,12 +308,16 @@ class _Writer:
         if joint.upper is not None:
             made.CreateUpperLimitAttr(float(joint.upper * unit))
         if joint.damping or joint.stiffness:
-            drive = self.physics.DriveAPI.Apply(made.GetPrim(), "angular" if joint.kind == "hinge" else "linear")
-            drive.CreateTypeAttr(self.physics.Tokens.force)
-            drive.CreateStiffnessAttr(float(joint.stiffness / unit))
-            drive.CreateDampingAttr(float(joint.damping / unit))
-            if joint.torque_limit is not None:
-                drive.CreateMaxForceAttr(float(joint.torque_limit))
+            self._drive(made, joint, unit)
+
+    def _drive(self, made: Any, joint: JointModel, unit: float) -> None:
+        """Add the damping and the servo of a joint, whose positions have this unit [rad, m]."""
+        drive = self.physics.DriveAPI.Apply(made.GetPrim(), "angular" if joint.kind == "hinge" else "linear")
+        drive.CreateTypeAttr(self.physics.Tokens.force)
+        drive.CreateStiffnessAttr(float(joint.stiffness / unit))
+        drive.CreateDampingAttr(float(joint.damping / unit))
+        if joint.torque_limit is not None:
+            drive.CreateMaxForceAttr(float(joint.torque_limit))
 
     # Values
 

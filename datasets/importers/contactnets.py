@@ -171,17 +171,22 @@ def _require_fields(path: Path, data: Mapping[str, NDArray[Any]]) -> None:
                 f"numbers with {dimensions} axes.",
                 "take the original file.",
             )
-    for name, width in (("pos", 3), ("quat_wxyz", 4), ("vel", 3), ("omega_body", 3)):
-        if data[name].shape != (len(data["pos"]), width):
-            raise InputDataError(
-                f"{path}: '{name}' has the shape {data[name].shape}.", f"(rows, {width}).", "take the original file."
-            )
+    _require_rows(path, data)
     if not (data["rate_hz"] > 0 and data["half_width_m"] > 0):
         raise InputDataError(
             f"{path}: rate_hz {data['rate_hz']}, half_width_m {data['half_width_m']}.",
             "both > 0.",
             "take the original file.",
         )
+
+
+def _require_rows(path: Path, data: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse poses and velocities of different numbers of rows, or of wrong widths."""
+    for name, width in (("pos", 3), ("quat_wxyz", 4), ("vel", 3), ("omega_body", 3)):
+        if data[name].shape != (len(data["pos"]), width):
+            raise InputDataError(
+                f"{path}: '{name}' has the shape {data[name].shape}.", f"(rows, {width}).", "take the original file."
+            )
 
 
 def _track(where: str, rows: Array, rate_hz: float) -> Track:

@@ -81,9 +81,11 @@ def _only_urdf(source: Path, folder: Path) -> Path:
 
 def _only_hinge(urdf: Path) -> JointOfRobot:
     found = read_articulation(urdf)
-    meshed = next((link.name for link in found.links for part in link.geometry if part.mesh is not None), None)
-    if meshed is not None:
-        raise InputDataError(f"{urdf.name}: link '{meshed}' is a mesh.", "boxes, as in the published file.", _TODO)
+    for link in found.links:
+        if any(part.mesh is not None for part in link.geometry):
+            raise InputDataError(
+                f"{urdf.name}: link '{link.name}' is a mesh.", "boxes, as in the published file.", _TODO
+            )
     joints = found.joints
     if len(joints) != 1 or joints[0].kind != "hinge":
         listed = ", ".join(f"{joint.name} ({joint.kind})" for joint in joints)

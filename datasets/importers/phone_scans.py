@@ -205,10 +205,14 @@ def _numbered(photos: list[Photo], count: int, path: Path) -> list[tuple[int, Ph
     return sorted(found, key=lambda one: one[0])
 
 
+def _maps(folder: Path) -> dict[str, Path]:
+    """Return the maps in a folder by their names without suffix."""
+    return {path.stem: path for path in entries_of(folder) if path.suffix.lower() == ".png"}
+
+
 def _copy_depth(root: Path, directory: Path, photos: list[Photo]) -> None:
     """Write the depth maps of photos [mm] in their size, without pixels that have no confidence."""
-    there = {path.stem: path for path in entries_of(root / "depth") if path.suffix.lower() == ".png"}
-    sure = {path.stem: path for path in entries_of(root / "confidence") if path.suffix.lower() == ".png"}
+    there, sure = _maps(root / "depth"), _maps(root / "confidence")
     known = [photo for photo in photos if Path(photo.name).stem in there]
     if known:
         (directory / "depth").mkdir()

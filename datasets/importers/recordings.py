@@ -125,15 +125,7 @@ class Units:
         """Refuse numbers that are hardly seconds or metres where nobody said that they are."""
         step, spread = float(np.median(np.diff(time))), float(np.ptp(position, axis=0).max())
         if self.time is None and step >= _SLOWEST_STEP_S:
-            unit = "ms" if step < 500 else "us" if step < 5e5 else "ns"
-            raise InputDataError(
-                f"{where}: from sample to sample the time grows by {step:.6g}: hardly seconds.",
-                "seconds, or another unit that is named.",
-                f"add --time-unit {unit} (or, if these are seconds: --time-unit s)."
-                if step != 1
-                else "numbers of frames: divide them by the frame rate (csv: --frame-rate HZ). Or add --time-unit ms "
-                "(if these are seconds: s).",
-            )
+            raise _hardly_seconds(where, step)
         if self.length is None and spread > _LONGEST_PATH_M:
             raise InputDataError(
                 f"{where}: positions spread over {spread:.6g}: hardly metres.",
@@ -359,6 +351,19 @@ def write_recordings(
         splits={name: len(episodes) for name, episodes in splits.items()},
         warnings=gap_warnings(recordings),
     )
+
+
+def _hardly_seconds(where: str, step: float) -> InputDataError:
+    """Return the error of times without a unit that grow by so much from sample to sample."""
+    unit = "ms" if step < 500 else "us" if step < 5e5 else "ns"
+    todo = f"add --time-unit {unit} (or, if these are seconds: --time-unit s)."
+    if step == 1:
+        todo = (
+            "numbers of frames: divide them by the frame rate (csv: --frame-rate HZ). Or add --time-unit ms "
+            "(if these are seconds: s)."
+        )
+    found = f"{where}: from sample to sample the time grows by {step:.6g}: hardly seconds."
+    return InputDataError(found, "seconds, or another unit that is named.", todo)
 
 
 def require_only(where: str, kind: str, only: str | None, legal: Iterable[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from ...schemas import UsageError
 LONGEST_NAME = 200
 """Maximum length of an output's name [bytes]: file systems take 255, and the unfinished output has a longer name."""
 _LONGEST_PART = 255
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _ANOTHER = "choose another name for the output."
 
 
@@ -22,9 +24,9 @@ def require_place(path: Path | str) -> None:
             or cannot be written to.
     """
     path = Path(path)
-    strange = next((letter for letter in str(path) if ord(letter) < 32 or ord(letter) == 127), None)
+    strange = _CONTROL.search(str(path))
     if strange is not None:
-        raise UsageError(f"{str(path)!r}: a name with the control character {strange!r}.", todo=_ANOTHER)
+        raise UsageError(f"{str(path)!r}: a name with the control character {strange[0]!r}.", todo=_ANOTHER)
     for part in path.parent.parts:
         _require_short(part, _LONGEST_PART)
     _require_short(path.name, LONGEST_NAME)

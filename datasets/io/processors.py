@@ -69,9 +69,7 @@ def _quotas() -> Iterator[float]:
             continue
         root = _CGROUPS if not controllers else _CGROUPS / controllers
         folder = root / path.lstrip("/")
-        for group in (folder, *folder.parents):
-            if not group.is_relative_to(root):
-                break
+        for group in (group for group in (folder, *folder.parents) if group.is_relative_to(root)):
             yield from _quota(group)
 
 

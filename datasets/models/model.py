@@ -89,8 +89,6 @@ def read_model(path: Path | str) -> Model:
         if surface.mesh is not None:
             _inside(root, surface.mesh.path)
     scene = None if file.scene is None else read_splats(_inside(root, file.scene), harmonics=True)
-    names = [body.name for body in file.bodies]
-    tracks = {path.stem: read_tracks(path, names)[0] for path in sorted((root / POSE_TRACKS).glob("*.csv"))}
     return Model(
         root=root,
         file=file,
@@ -101,8 +99,13 @@ def read_model(path: Path | str) -> Model:
         fit=read_json(root / "fit.json", FitFile) if (root / "fit.json").is_file() else FitFile(),
         cameras=_cameras(root / CAMERAS),
         pictures={name: (root / name).read_bytes() for name in PICTURES if (root / name).is_file()},
-        tracks=tracks,
+        tracks=_pose_tracks(root, [body.name for body in file.bodies]),
     )
+
+
+def _pose_tracks(root: Path, names: list[str]) -> dict[str, dict[str, Track]]:
+    """Return the poses that a fit of videos has found, by episode and body."""
+    return {path.stem: read_tracks(path, names)[0] for path in sorted((root / POSE_TRACKS).glob("*.csv"))}
 
 
 def _spheres(root: Path, file: ModelFile) -> tuple[dict[str, Splats], dict[str, Splats]]:
