@@ -141,8 +141,8 @@ def follows_heading(whole: Segments, values: Mapping[int, Array]) -> bool:
 
 def _way(whole: Segments, k: int) -> Array:
     """Return the displacement (3,) [m] between the first and the last measured frame of a flight."""
-    seen = torch.nonzero(whole.observations.seen[k].flatten())[:, 0]
-    place = whole.observations.position_m[k].reshape(-1, 3)
+    seen = torch.nonzero(whole.observations.seen[k, :, 0])[:, 0]
+    place = whole.observations.position_m[k, :, 0]
     return (place[seen[-1]] - place[seen[0]]).numpy()
 
 
@@ -180,8 +180,8 @@ def _second_halves(whole: Segments, name: str) -> Tensor:
     values = _estimated(first, parameters)[0] if parameters else seen.times_s.new_zeros(len(known), 0)
     fitted, late = continued(whole, parameters, values)
     away = (fitted.positions(parameters, values) - seen.position_m).square().sum(-1)
-    weight = (seen.seen * late).squeeze(-1) if away.dim() == 2 else seen.seen * late
-    return ((away * weight).flatten(1).sum(1) / weight.flatten(1).sum(1).clamp_min(1.0)).sqrt()
+    weight = seen.seen * late
+    return ((away * weight).sum((1, 2)) / weight.sum((1, 2)).clamp_min(1.0)).sqrt()
 
 
 def _estimated(segments: Segments, parameters: Sequence[Parameter]) -> tuple[Tensor, Tensor, Segments]:
