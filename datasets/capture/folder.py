@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,6 +37,10 @@ class CheckedTracks(NamedTuple):
     """Free bodies whose orientation is the same in all rows."""
 
 
+MOST_KEPT = 1_000_000
+"""Samples of the track files that a capture keeps in memory, at 64 bytes each with orientations."""
+
+
 @dataclass(frozen=True, eq=False)
 class CaptureFolder:
     """A capture directory. Everything except the manifest and the cameras is read from disk on demand."""
@@ -51,6 +55,8 @@ class CaptureFolder:
     """The splits that may be read; None for everything."""
     inconsistencies: tuple[str, ...] = ()
     """What gravity, ground, shapes and motion disagree about, without a fault."""
+    read: dict[object, tuple[dict[str, Track], int]] = field(default_factory=dict, repr=False)
+    """What track files hold that were read, by name, bodies, and time and size of the file."""
 
     @property
     def body_names(self) -> list[str]:
@@ -186,7 +192,7 @@ class CaptureFolder:
         path = optional_file(self.root / "tracks" / f"{episode}.csv")
         if path is None:
             return CheckedTracks({}, 0, ())
-        tracks, normalised = read_tracks(path, self.body_names)
+        tracks, normalised = self._read_once(path)
         for name, track in tracks.items():
             _require_exerted(path, self.body(name), track)
         unturned = [name for name, track in tracks.items() if self._is_unturned(name, track)]
@@ -198,6 +204,19 @@ class CaptureFolder:
             _require_samples(path, name, episode, track, tracks[name])
             require_told_spin(path, name, track)
         return CheckedTracks(windowed, normalised, tuple(unturned))
+
+    def _read_once(self, path: Path) -> tuple[dict[str, Track], int]:
+        """Return the tracks in a file, as :func:`read_tracks` does, from memory if it is as it was when it was read."""
+        state = path.stat()
+        key = path, *self.body_names, state.st_mtime_ns, state.st_size
+        if key not in self.read:
+            found = read_tracks(path, self.body_names)
+            kept = sum(len(track) for tracks, _ in (found, *self.read.values()) for track in tracks.values())
+            if kept > MOST_KEPT:
+                return found
+            self.read[key] = found
+        tracks, normalised = self.read[key]
+        return dict(tracks), normalised
 
     def window_warning(self, episode: str, tracks: Mapping[str, Track]) -> str:
         """Return a warning about a `start_s` or `end_s` outside of an episode's tracks, or an empty text.

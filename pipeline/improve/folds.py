@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from ...datasets.capture.capture import Capture
-from ...datasets.capture.folder import CheckedTracks
 from ...datasets.models.model import Model, read_model, write_model
 from ...schemas import PhysConfig
 from ..phys_geo.stage import fit_motion
@@ -15,20 +14,6 @@ from ..runtime.checkpoint import Checkpoint
 
 _OTHERS = "other-episodes"
 """Name of the split, in memory, of the episodes outside of a fold."""
-
-
-@dataclass(frozen=True, eq=False)
-class ReadOnce(Capture):
-    """A capture whose tracks are read from disk once."""
-
-    read: dict[str, CheckedTracks] = field(default_factory=dict)
-    """Tracks by episode, as far as they were asked for."""
-
-    def checked_tracks(self, episode: str) -> CheckedTracks:
-        """Return the tracks of an episode with the findings about them."""
-        if episode not in self.read:
-            self.read[episode] = super().checked_tracks(episode)
-        return self.read[episode]
 
 
 def folds_of(episodes: Sequence[str], count: int) -> tuple[tuple[str, ...], ...]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from ...datasets.capture.capture import Capture
 from ...datasets.capture.tracks import Episode
 from ...datasets.io.progress import note
 from ...datasets.models.effect_files import effect_file
@@ -32,7 +33,7 @@ from ..physics.effects.trust import trust_effects
 from ..runtime.resources import one_torch_thread
 from ..segments.candidates import Candidate
 from ..segments.prepare import Prepared
-from .folds import ReadOnce, fitted_without
+from .folds import fitted_without
 from .held_out_errors import HeldOutErrors, error_ratio, prepared_episodes, typical_errors
 from .ladder_files import LadderFiles
 from .proposals import Proposal, proposals_of
@@ -62,7 +63,7 @@ class Ladder:
 class Climb:
     """What all steps of a ladder share."""
 
-    capture: ReadOnce
+    capture: Capture
     """The capture, restricted to the split."""
     split: str
     """Name of the split on which everything is decided."""

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from ...datasets.capture.capture import Capture
 from ...datasets.io.atomic import copy_files, new_directory, sha256
 from ...datasets.io.neighbours import clean_stale
 from ...datasets.io.outputs import reads, refuse_output
@@ -32,7 +33,7 @@ from ..diagnose.stage import library_of
 from ..fit import fit
 from ..physics.model_world import world_of_model
 from ..runtime.device import resolve_device
-from .folds import ReadOnce, folds_of
+from .folds import folds_of
 from .ladder import Climb, Ladder
 from .ladder_files import LadderFiles, differing
 from .page import PAGE, asking_step, ladder_html
@@ -46,7 +47,7 @@ DOCUMENT = "improve.json"
 class _Request:
     """Arguments of an improvement."""
 
-    capture: ReadOnce
+    capture: Capture
     """The capture, restricted to the split."""
     out: Path
     """Directory of the ladder."""
@@ -146,7 +147,7 @@ def improve(
     library = library_of(candidates)
     accepted = accept_units or (parent is not None and read_model(parent).accepts_units)
     request = _Request(
-        capture=ReadOnce.open(capture, splits=(split,), accept_units=accepted),  # pyright: ignore[reportArgumentType]
+        capture=Capture.open(capture, splits=(split,), accept_units=accepted),
         out=out,
         parent=parent,
         split=split,

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...geometry.hull_faces import hull_faces
 from ...geometry.rotation import quat_to_matrix
 from ...physics.body import Body
 from ...segments.prepare import Prepared
@@ -68,17 +69,9 @@ def rest_tilts(prepared: Prepared, body: Body) -> dict[int, Array]:
 
 def _face_normals(body: Body) -> Array:
     """Return the outward normals (F, 3) of the faces of a body's colliding spheres; none for a round one."""
-    from scipy.spatial import ConvexHull, QhullError  # dear to import, and seldom needed
-
     chosen = slice(None) if body.on_plane is None else body.on_plane
     points = body.centers[0].double()[chosen].numpy()
     radii = body.radii[0].double()[chosen].numpy()
-    if len(points) < 4:
-        return np.zeros((0, 3))
-    try:
-        hull = ConvexHull(points)
-    except QhullError:
-        return np.zeros((0, 3))
     # a face of spheres of several sizes is not that of their centres
-    flat = [np.ptp(radii[one]) < 1e-3 * radii.max() for one in hull.simplices]
-    return np.unique(hull.equations[flat, :3].round(6), axis=0)
+    flat = [face.normal for face in hull_faces(points) if np.ptp(radii[face.corners]) < 1e-3 * radii.max()]
+    return np.unique(np.array(flat).reshape(-1, 3).round(6), axis=0)

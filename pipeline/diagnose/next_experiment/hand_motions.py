@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...geometry.hull_faces import hull_faces
 from ...geometry.rotation import quat_to_matrix
 from ...physics.body import Body
 from ...physics.impulse_solver import tangent_axes
@@ -180,22 +181,20 @@ def _largest_face(body: Body, normal: Array) -> Array | None:
 
     Of faces that are equally large, the one that is turned least from the ground, whose normal (3,) is given.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
     points, com = body.centers[0].numpy(), body.com[0].numpy()
-    try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):
+    hull = hull_faces(points if body.on_plane is None else points[body.on_plane])
+    if not hull:
         return None
     size = float(np.ptp(points, axis=0).max())
-    corners = points[hull.simplices]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    normals, offsets = np.array([face.normal for face in hull]), np.array([face.offset for face in hull])
+    areas = np.array([face.area for face in hull])
     faces = []
-    for plane in hull.equations:
-        below = com - (com @ plane[:3] + plane[3]) * plane[:3]
-        if bool((hull.equations @ np.append(below, 1.0) < INSIDE * size).all()):
-            same = hull.equations[:, :3] @ plane[:3] > SAME_FACE
-            faces.append((round(float(areas[same].sum() / areas.sum()), 2), -float(plane[:3] @ normal), plane[:3]))
+    for face in hull:
+        below = com - (com @ face.normal + face.offset) * face.normal
+        if bool((normals @ below + offsets < INSIDE * size).all()):
+            same = normals @ face.normal > SAME_FACE
+            share = round(float(areas[same].sum() / areas.sum()), 2)
+            faces.append((share, -float(face.normal @ normal), face.normal))
     return max(faces, key=lambda face: face[:2])[2] if faces else None
 
 

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 from cgwm.cli.app import app
+from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.io.atomic import sha256
 from cgwm.datasets.models.model import read_model, write_model
 from cgwm.datasets.synthetic.hidden_effects import cases, make_capture
 from cgwm.pipeline.diagnose.report.pictures import DrawnMotion
 from cgwm.pipeline.improve import improve
-from cgwm.pipeline.improve.folds import ReadOnce, folds_of
+from cgwm.pipeline.improve.folds import folds_of
 from cgwm.pipeline.improve.held_out_errors import HeldOutErrors, error_ratio, typical_error
 from cgwm.pipeline.improve.ladder import Climb, helps
 from cgwm.pipeline.improve.ladder_files import LadderFiles
@@ -122,9 +123,9 @@ def climb(tmp_path: Path) -> Climb:
     """A ladder at its first model, whose models without a fold are not fitted."""
     files = LadderFiles(tmp_path / "out", {}, resume=False, overwrite=False)
     write_small_model(files / "m0")
-    capture = ReadOnce.open(write_capture(tmp_path / "capture", 3), splits=("test",))
+    capture = Capture.open(write_capture(tmp_path / "capture", 3), splits=("test",))
     return Climb(
-        capture=capture,  # pyright: ignore[reportArgumentType]
+        capture=capture,
         split="test",
         files=files,
         folds=((),),
