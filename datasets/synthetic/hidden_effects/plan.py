@@ -25,6 +25,7 @@ Stage = Literal[
     "report9",
     "report10",
     "report11",
+    "report12",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on the first stage alone. Results on a report stage were known when `diagnose` was changed
@@ -42,15 +43,17 @@ afterwards, so that each of these changes has to be judged on a later stage:
 - `report8`: a value beyond the plausible size of its parameter counted against an effect, and segments of contact
   alone needed a larger score (2026-11-26);
 - `report9`: segments of contact named again what slides rank first, and some effects alone (2026-11-27);
-- `report10`: segments of contact were linearised at the fits of effects (2026-11-27).
+- `report10`: segments of contact were linearised at the fits of effects (2026-11-27);
+- `report11`: errors of sessions and second effects were weighed anew (2026-11-27).
 
-The present version is judged on `report11`."""
+The present version is judged on `report12`."""
 Noise = Literal["spread", "study"]
 
 UNKNOWN = tuple(name for name, entry in EFFECTS.items() if entry.acts == "unknown")
 """Effects that are in no library."""
 KNOWN = tuple(name for name in EFFECTS if name not in UNKNOWN)
-"""Effects of the library: all except `time_offset`, which requires a driven body."""
+"""Effects of the library: all except `time_offset`, which requires a driven body, and `spin_lift`, which requires
+tracks without orientation."""
 PAIRS: tuple[tuple[Kind, tuple[str, str]], ...] = (
     ("cube", ("linear_drag", "gravity_tilt")),
     ("cube", ("anisotropic_friction", "spin_damping")),
