@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,25 +22,29 @@ def request_of(verb: str, options: Mapping[str, Any]) -> str:
     """Return the digest of a verb, its settings and the content of its inputs; empty for verbs that record none."""
     if verb not in REMEMBERED:
         return ""
-    wanted = {name: _told(value) for name, value in options.items() if name not in _MANNERS}
+    out = options.get("out")
+    wanted = {name: _told(value, out) for name, value in options.items() if name not in _MANNERS}
     return hashlib.sha256(json.dumps([verb, wanted], sort_keys=True, default=str).encode()).hexdigest()
 
 
-def _told(value: Any) -> Any:
+def _told(value: Any, out: Path | None) -> Any:
     if isinstance(value, list | tuple):
-        return [_told(one) for one in value]
+        return [_told(one, out) for one in value]
     if not isinstance(value, Path):
         return value
     # a device has no end, and a pipe no second reading
-    return f"sha256 {_content(value)}" if value.is_file() or value.is_dir() else str(value)
+    return f"sha256 {_content(value, out)}" if value.is_file() or value.is_dir() else str(value)
 
 
-def _content(path: Path) -> str:
-    """Return a digest of a file, or of the names and contents of the files in a directory."""
+def _content(path: Path, out: Path | None) -> str:
+    """Return a digest of a file, or of the names and contents of the files in a directory, without its own output."""
     from ..schemas.regular_files import require_regular_file
 
     digest = hashlib.sha256()
-    files = sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():
+        own = None if out is None else path / os.path.relpath(out, path)  # masks of a capture lie in it
+        files = sorted(one for one in path.rglob("*") if one.is_file() and (own is None or own not in one.parents))
     for file in files:
         size = file.stat().st_size
         digest.update(f"{file.relative_to(path).as_posix()}\0{size}\0".encode())

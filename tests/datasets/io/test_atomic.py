@@ -199,3 +199,12 @@ def test_a_file_that_may_not_be_read_is_refused_by_name(tmp_path: Path, monkeypa
     for work in (sha256, lambda folder: request_of("mask", {"source": folder})):
         with pytest.raises(InputDataError, match=r"a\.jpg: cannot be read: Permission denied"):
             work(tmp_path)
+
+
+def test_an_output_inside_of_its_input_is_no_part_of_the_request(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"a")
+    first = request_of("mask", {"source": tmp_path, "out": tmp_path / "masks"})
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "a.png").write_bytes(b"1")
+    assert request_of("mask", {"source": tmp_path, "out": tmp_path / "masks"}) == first
+    assert request_of("mask", {"source": tmp_path, "out": tmp_path / "other"}) != first
