@@ -2,6 +2,11 @@
 
 Scanned objects are photographed on a turntable and in hand before black, white and cluttered backgrounds
 (`object_photos`); of each set some photos, drawn at random, may be left out. cgwm gets the photos and nothing else.
+A run is silently wrong if it writes cameras of which one is beyond 0.3 % of the extent of all true centres, or 1 deg,
+by the best similarity of the centres, and no warning says that centres or rotations are uncertain; whether all photos
+are registered makes no difference, nor does a warning of anything else. Beside the runs, photos are counted that are
+beyond these bars while their own stated errors are below the limits of the warnings.
+
 COLMAP gets the same photos with its defaults and each camera model in turn; the best of them, chosen with the truth, is
 the rival. What cgwm says of its own errors (`center_std_percent`, `rotation_std_deg`) stands beside the true ones of
 every photo. Run with
@@ -28,7 +33,9 @@ import numpy as np
 import pycolmap
 from calibrate import make_capture
 from cgwm.pipeline.calibrate import calibrate
+from cgwm.pipeline.calibrate.center_uncertainty import UNCERTAIN_CENTER
 from cgwm.pipeline.calibrate.metric_scale import umeyama
+from cgwm.pipeline.calibrate.stage import UNCERTAIN_ROTATION_DEG
 from cgwm.schemas import CalibrateConfig, CalibrationReport, CamerasFile, NotConvergedError, read_json
 from mesh_photos import scanned
 from object_photos import Session, photograph, poses, write_photos
@@ -187,6 +194,24 @@ def right(row: dict[str, Any], photos: int) -> bool:
     )
 
 
+def wrong(row: dict[str, Any]) -> bool:
+    """Return whether cameras are written and one of them is not where its photo was taken."""
+    return row["registered"] > 0 and (
+        row.get("centre_percent", np.inf) > RIGHT_CENTRE_PERCENT or row.get("rotation_deg", np.inf) > RIGHT_ROTATION_DEG
+    )
+
+
+def hidden_photos(row: dict[str, Any]) -> int:
+    """Return how many photos are not where they were taken, while their own stated errors give no warning."""
+    if "centre_errors_percent" not in row:
+        return 0
+    off = np.array(row["centre_errors_percent"]) > RIGHT_CENTRE_PERCENT
+    off |= np.array(row["rotation_errors_deg"]) > RIGHT_ROTATION_DEG
+    stated = np.array(row["centre_stds_percent"]) > 100 * UNCERTAIN_CENTER
+    stated |= np.array(row["rotation_stds_deg"]) > UNCERTAIN_ROTATION_DEG
+    return int((off & ~stated).sum())
+
+
 def _said(row: dict[str, Any]) -> bool:
     return any("optical centres of" in one or "rotations of" in one for one in row["warnings"])
 
@@ -289,9 +314,11 @@ def print_counts(rows: list[tuple[dict[str, Any], dict[str, Any] | None]]) -> No
     solved = [good for good, other in both if any(right(one, other["photos"]) for one in other["models"].values())]
     print(f"right: cgwm {sum(ok)} of {len(mine)}")
     print(f"COLMAP with its best model {len(solved)} of {len(both)}, of these cgwm {sum(solved)}")
-    wrong = [row for row, good in zip(mine, ok, strict=True) if not good and row["registered"] > 0]
-    silent = [row for row in wrong if row["registered"] == row["photos"] and not _said(row)]
-    print(f"written but not right: {len(wrong)}, of these complete and without a warning: {len(silent)}")
+    bad = [row for row in mine if wrong(row)]
+    silent = sum(not _said(row) for row in bad)
+    print(f"written: {sum(row['registered'] > 0 for row in mine)}, of these with a photo beyond the bars: {len(bad)}")
+    print(f"silently wrong: {silent} of {len(mine)}")
+    print(f"photos beyond the bars whose own stated errors give no warning: {sum(map(hidden_photos, mine))}")
     print(f"right with such a warning: {sum(good and _said(row) for row, good in zip(mine, ok, strict=True))}")
     for part in ("centre", "rotation"):
         unit = "percent" if part == "centre" else "deg"

@@ -73,6 +73,8 @@ class Candidate:
     """Focal lengths of the cameras with EXIF data, by camera."""
     motion: TurntableMotion | None
     """The turntable that the poses of the model are on; None where cameras are free."""
+    noise_px: dict[str, float]
+    """Noise of observations by image, before some were dropped."""
     attempt: int
     """Number of the attempt."""
 
@@ -180,6 +182,7 @@ def _attempt(
             features=features,
             focals=focals,
             motion=found.motion if found else None,
+            noise_px={names[image]: noise for image, noise in models[0].noise_px.items()},
             attempt=number,
         )
     return candidate, _attempt_figures(settings, candidate)

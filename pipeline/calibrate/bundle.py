@@ -87,7 +87,11 @@ class ReducedEquations:
 
 
 def linearized(
-    model: SfmModel, models: Map[str, str], loss_px: float = np.inf, principal: bool = False
+    model: SfmModel,
+    models: Map[str, str],
+    loss_px: float = np.inf,
+    principal: bool = False,
+    noise_px: Map[str, float] | None = None,
 ) -> NormalEquations:
     """Return the normal equations of a model.
 
@@ -96,6 +100,8 @@ def linearized(
         models: COLMAP's camera model of each camera whose intrinsics are free.
         loss_px: Scale of a Cauchy loss [px], by which the observations are weighted.
         principal: Whether the principal points of these cameras are free, too.
+        noise_px: Noise by image [px], of which errors are then multiples, and the scale of the loss one; None if all
+            have one.
     """
     columns: dict[str, int] = {}
     size = POSE * len(model.T_cam_world)
@@ -114,7 +120,7 @@ def linearized(
             own = np.r_[own, columns[camera] + np.arange(lens.shape[2])]
         mine, seen = np.concatenate([pose, lens], 2), model.observations[image][1]
         lengths.append(np.linalg.norm(residual, axis=1))
-        weight = 1.0 / (1.0 + (lengths[-1] / loss_px) ** 2)
+        weight = _weights(lengths[-1], loss_px, 1.0 if noise_px is None else noise_px[image])
         matrix[np.ix_(own, own)] += np.einsum("o,oai,oaj->ij", weight, mine, mine)
         right[own] -= np.einsum("o,oai,oa->i", weight, mine, residual)
         np.add.at(points, seen, np.einsum("o,oai,oaj->oij", weight, point, point))
@@ -134,8 +140,18 @@ def linearized(
     )
 
 
+def _weights(lengths_px: Array, loss: float, noise_px: float) -> Array:
+    """Return the weights of observations with errors of these lengths under a Cauchy loss."""
+    return 1.0 / (noise_px**2 + (lengths_px / loss) ** 2)
+
+
 def told_by_points(
-    model: SfmModel, models: Map[str, str], reduced: ReducedEquations, direction: Array, loss_px: float
+    model: SfmModel,
+    models: Map[str, str],
+    reduced: ReducedEquations,
+    direction: Array,
+    loss_px: float,
+    noise_px: Map[str, float] | None = None,
 ) -> Array:
     """Return how much the observations of each point tell of a change of poses and intrinsics, shape (point,).
 
@@ -147,6 +163,7 @@ def told_by_points(
         reduced: Its reduced equations, with principal points.
         direction: The change, shape (n,).
         loss_px: As in `linearized`.
+        noise_px: As there.
     """
     moves = (reduced.whole.coupling.T @ direction).reshape(-1, 3)
     told = -np.einsum("pi,pi->p", moves, np.asarray(reduced.inverse @ moves.ravel()).reshape(-1, 3))
@@ -157,22 +174,14 @@ def told_by_points(
         if camera in models:
             at, free = reduced.whole.columns[camera], lens.shape[2]
             change += lens @ direction[at : at + free] + direction[at + free : at + free + PRINCIPAL]
-        weight = 1.0 / (1.0 + (np.linalg.norm(residual, axis=1) / loss_px) ** 2)
+        weight = _weights(np.linalg.norm(residual, axis=1), loss_px, 1.0 if noise_px is None else noise_px[image])
         np.add.at(told, model.observations[image][1], weight * (change**2).sum(1))
     return told
 
 
-def errors_px(model: SfmModel, image: str) -> Array:
-    """Return the reprojection errors of an image's observations [px], shape (observation,)."""
-    pixels, seen = model.observations[image]
-    pose = model.T_cam_world[image]
-    drawn = model.camera(image).project(model.points[seen] @ pose[:3, :3].T + pose[:3, 3])
-    return np.linalg.norm(drawn - pixels, axis=1)
-
-
 def all_errors_px(model: SfmModel) -> Array:
     """Return the reprojection errors of all observations [px], image by image, shape (observation,)."""
-    return np.concatenate([errors_px(model, image) for image in model.T_cam_world])
+    return np.concatenate([model.errors_px(image) for image in model.T_cam_world])
 
 
 def moved_lens(camera: SfmCamera, lens: str, step: Array) -> SfmCamera:

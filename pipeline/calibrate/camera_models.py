@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .mapping import noise_px
+from .observation_noise import noise_px
 from .reconstruction import Array
 
 LADDER = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")

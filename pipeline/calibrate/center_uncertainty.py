@@ -39,7 +39,11 @@ def center_stds(
 
 
 def pose_stds(
-    model: SfmModel, models: Map[str, str], with_exif: Collection[str] = (), motion: TurntableMotion | None = None
+    model: SfmModel,
+    models: Map[str, str],
+    with_exif: Collection[str] = (),
+    motion: TurntableMotion | None = None,
+    noise_px: Map[str, float] | None = None,
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return what `center_stds` does, and the standard deviation of each camera's rotation [rad] after that alignment.
 
@@ -51,10 +55,11 @@ def pose_stds(
         models: As there.
         with_exif: As there.
         motion: As there.
+        noise_px: Noise of observations by image [px], before some were dropped; None takes that of those left.
     """
     for _ in range(_TIMES_DOUBTED):
-        model = without_most_telling(model, models, with_exif, motion)
-    return _stds(model, posterior(model, models, with_exif, motion))
+        model = without_most_telling(model, models, with_exif, motion, noise_px)
+    return _stds(model, posterior(model, models, with_exif, motion, noise_px))
 
 
 def _stds(model: SfmModel, found: Posterior) -> tuple[dict[str, float], dict[str, float]]:

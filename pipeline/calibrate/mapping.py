@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Mapping as Map
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,20 +18,17 @@ import pycolmap
 from ...datasets.io.progress import progress
 from ...schemas import CameraIntrinsics
 from .colmap import camera_names, count, run
+from .observation_noise import noise_by_image, noise_px
 from .reconstruction import Array, SfmCamera, SfmModel
 
 _Given = TypeVar("_Given")
 _MIN_MODEL_IMAGES = 3
 LOSS_SCALE = 2.0
 """Scale of the Cauchy loss, in standard deviations of a coordinate of the residuals."""
-LEAST_NOISE_PX = 0.05
-"""Lower bound of that standard deviation [px]; without one, exact observations would have no scale."""
 _KEEP_WITHIN = (4.0, 3.0)
 """Residuals above this many standard deviations are taken for wrong matches, in turn, each after an adjustment."""
 _LEAST_PARALLAX = 0.002
 """Angle between the rays of a point [rad] below which it is dropped; COLMAP triangulates none below 0.026."""
-_MEDIAN_OF_RAYLEIGH = 1.1774
-"""Median length of a vector of two normal numbers with standard deviation 1: sqrt(2 ln 2)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +39,8 @@ class Mapped:
     """pycolmap's reconstruction; what adjusts it works on a copy."""
     names: dict[int, str]
     """Name of each camera by COLMAP's identifier."""
+    noise_px: Map[str, float] = field(default_factory=dict)
+    """Noise of a coordinate of each image's observations [px] before some were dropped; empty where none were."""
 
     @property
     def image_count(self) -> int:
@@ -170,7 +169,7 @@ def _with_numbers(
             put(camera, values, given[mapped.names[identifier]])
             camera.params = values.tolist()
     _adjust(copy, _fixed(mapped, known), seed, focal_lengths=focal_lengths)
-    return Mapped(reconstruction=copy, names=mapped.names)
+    return replace(mapped, reconstruction=copy)
 
 
 def without_outliers(mapped: Mapped, known: Map[str, CameraIntrinsics], seed: int) -> Mapped:
@@ -181,7 +180,7 @@ def without_outliers(mapped: Mapped, known: Map[str, CameraIntrinsics], seed: in
         _drop_undetermined(copy)
         _adjust(copy, _fixed(mapped, known), seed)
     _drop_undetermined(copy)
-    return Mapped(reconstruction=copy, names=mapped.names)
+    return Mapped(reconstruction=copy, names=mapped.names, noise_px=noise_by_image(mapped.model()))
 
 
 def triangulated(mapped: Mapped, database: Path, root: Path, seed: int) -> Mapped:
@@ -214,11 +213,6 @@ def triangulated(mapped: Mapped, database: Path, root: Path, seed: int) -> Mappe
         seed,
     )
     return Mapped(reconstruction=found, names=mapped.names)
-
-
-def noise_px(residuals_px: Array) -> float:
-    """Return the standard deviation of a coordinate of the residuals from their median length [px]."""
-    return max(float(np.median(residuals_px)) / _MEDIAN_OF_RAYLEIGH, LEAST_NOISE_PX)
 
 
 def _options(seed: int) -> Any:

@@ -10,6 +10,10 @@ The factor f is there since observations share errors. Neighbouring patches hold
 shifts with the direction of view, and what all observations of a place have in common is fitted by poses and points: no
 residual shows it, and no scatter between parts of the points does.
 
+The noise sigma is that of each image's observations before those far off were dropped (`observation_noise`): what is
+left agrees with the cameras by selection. Where it is not given, one noise of the residuals stands for all images, with
+a factor for what dropping hides.
+
 What a camera model leaves out is not known to be zero: where it has no distortion, k1 has a prior.
 """
 
@@ -24,14 +28,19 @@ import numpy as np
 from .bundle import POSE, PRINCIPAL, ReducedEquations, all_errors_px, linearized, told_by_points
 from .camera_models import LADDER, LENS_PARAMETERS
 from .focal_prior import EXIF_STD
-from .mapping import LEAST_NOISE_PX, LOSS_SCALE, noise_px
+from .mapping import LOSS_SCALE
+from .observation_noise import LEAST_NOISE_PX, noise_by_image
+from .observation_noise import noise_px as common_noise_px
 from .reconstruction import Array, SfmModel
 from .triangulation import cross_matrices
 from .turntable_motion import TurntableMotion
 
-SHARED_VARIANCE = 4.0
+SHARED_VARIANCE = 2.0
 """Variance of the errors of poses, in units of that of independent errors: calibrated on photos of scanned objects with
 known cameras ([Thresholds](../../docs/thresholds.md))."""
+HIDDEN_VARIANCE = 2.0
+"""Variance of the observations of a model, in units of what the residuals of those that were kept show of it: it stands
+for the noise by image where that is not given."""
 
 PRINCIPAL_STD = 0.005
 """Standard deviation of a coordinate of the principal point about the middle, as a fraction of the picture's diagonal:
@@ -80,6 +89,7 @@ class _Solution:
     pull: Array
     principal: dict[str, int]
     loss_px: float
+    noise_px: dict[str, float] | None
 
     def weakest(self, images: int) -> Array:
         """Return the direction in which the centres are least certain, shape (n,)."""
@@ -89,7 +99,11 @@ class _Solution:
 
 
 def posterior(
-    model: SfmModel, models: Map[str, str], with_exif: Collection[str] = (), motion: TurntableMotion | None = None
+    model: SfmModel,
+    models: Map[str, str],
+    with_exif: Collection[str] = (),
+    motion: TurntableMotion | None = None,
+    noise_px: Map[str, float] | None = None,
 ) -> Posterior:
     """Return how far a model is from the most probable poses and intrinsics, and how certain these are.
 
@@ -98,8 +112,10 @@ def posterior(
         models: COLMAP's camera model of each camera whose intrinsics were estimated.
         with_exif: Those cameras among them whose focal length EXIF data have told, too.
         motion: The turntable that the poses were constrained to, whose axis is z; the numbers are then those of it.
+        noise_px: Noise of observations by image [px], before some were dropped; None takes one for all images, that of
+            the observations that the model has.
     """
-    found = _solved(model, models, with_exif, motion)
+    found = _solved(model, models, with_exif, motion, noise_px)
     return Posterior(
         step=found.basis @ (found.inverse @ found.pull),
         variances=np.einsum("ij,jk,ik->i", found.basis, found.inverse, found.basis, optimize=True),
@@ -109,7 +125,11 @@ def posterior(
 
 
 def without_most_telling(
-    model: SfmModel, models: Map[str, str], with_exif: Collection[str], motion: TurntableMotion | None
+    model: SfmModel,
+    models: Map[str, str],
+    with_exif: Collection[str],
+    motion: TurntableMotion | None,
+    noise_px: Map[str, float] | None = None,
 ) -> SfmModel:
     """Return a model without the points that tell most of the direction in which its centres are least certain.
 
@@ -121,9 +141,10 @@ def without_most_telling(
         models: As there.
         with_exif: As there.
         motion: As there.
+        noise_px: As there.
     """
-    found, images = _solved(model, models, with_exif, motion), list(model.T_cam_world)
-    told = told_by_points(model, found.models, found.reduced, found.weakest(len(images)), found.loss_px)
+    found, images = _solved(model, models, with_exif, motion, noise_px), list(model.T_cam_world)
+    told = told_by_points(model, found.models, found.reduced, found.weakest(len(images)), found.loss_px, found.noise_px)
     photo = np.repeat(np.arange(len(images)), [len(model.observations[image][1]) for image in images])
     point = np.concatenate([model.observations[image][1] for image in images])
     seen = np.split(photo[np.argsort(point, kind="stable")], np.cumsum(np.bincount(point, minlength=len(told)))[:-1])
@@ -140,18 +161,24 @@ def without_most_telling(
 
 
 def _solved(
-    model: SfmModel, models: Map[str, str], with_exif: Collection[str], motion: TurntableMotion | None
+    model: SfmModel,
+    models: Map[str, str],
+    with_exif: Collection[str],
+    motion: TurntableMotion | None,
+    noise_px: Map[str, float] | None,
 ) -> _Solution:
     lengths = all_errors_px(model)
+    by_image = None if noise_px is None else _noise_by_image(model, noise_px)
     lenses = {camera: max(name, "SIMPLE_RADIAL", key=LADDER.index) for camera, name in models.items()}
-    loss_px = LOSS_SCALE * noise_px(lengths)
-    reduced = linearized(model, lenses, loss_px, principal=True).reduced()
+    loss_px = LOSS_SCALE * (common_noise_px(lengths) if by_image is None else 1.0)
+    reduced = linearized(model, lenses, loss_px, principal=True, noise_px=by_image).reduced()
     focal = reduced.whole.columns
     principal = {camera: column + LENS_PARAMETERS[lenses[camera]] for camera, column in focal.items()}
     size = len(reduced.matrix)
     design = np.eye(size) if motion is None else _design(model, motion, size)
     weights = _weights(lengths)
-    scale = 1.0 / (SHARED_VARIANCE * _noise_px(model, lengths, weights, design.shape[1]) ** 2)
+    shown = HIDDEN_VARIANCE * _noise_px(model, lengths, weights, design.shape[1]) ** 2 if by_image is None else 1.0
+    scale = 1.0 / (SHARED_VARIANCE * shown)
     # the loss is curved less than its weights say, by sum w^2 / sum w for Cauchy's; steps are longer by as much
     information, pull = scale * reduced.matrix, scale * reduced.right * (weights.sum() / (weights**2).sum())
     for camera, column in principal.items():
@@ -172,7 +199,13 @@ def _solved(
         pull=basis.T @ pull,
         principal=principal,
         loss_px=loss_px,
+        noise_px=by_image,
     )
+
+
+def _noise_by_image(model: SfmModel, noise_px: Map[str, float]) -> dict[str, float]:
+    """Return the noise of each image's observations: at least that of those which the model has."""
+    return {image: max(own, noise_px.get(image, 0.0)) for image, own in noise_by_image(model).items()}
 
 
 def _inverse(information: Array) -> Array:
@@ -208,7 +241,7 @@ def _about_the_middle(model: SfmModel, camera: str) -> tuple[Array, float]:
 
 def _weights(lengths: Array) -> Array:
     """Return the weights of errors [px] under the loss of the adjustment."""
-    return 1.0 / (1.0 + (lengths / (LOSS_SCALE * noise_px(lengths))) ** 2)
+    return 1.0 / (1.0 + (lengths / (LOSS_SCALE * common_noise_px(lengths))) ** 2)
 
 
 def _noise_px(model: SfmModel, lengths: Array, weights: Array, numbers: int) -> float:

@@ -140,6 +140,12 @@ class SfmModel:
         """Return all optical centres in the order of `T_cam_world`, shape (image, 3)."""
         return np.array([self.center(image) for image in self.T_cam_world])
 
+    def errors_px(self, image: str) -> Array:
+        """Return the reprojection errors of an image's observations [px], shape (observation,)."""
+        (pixels, seen), pose = self.observations[image], self.T_cam_world[image]
+        drawn = self.camera(image).project(self.points[seen] @ pose[:3, :3].T + pose[:3, 3])
+        return np.linalg.norm(drawn - pixels, axis=1)
+
     def renamed(self, names: Mapping[str, str]) -> SfmModel:
         """Return the model with other names of the images."""
         return replace(

@@ -323,7 +323,7 @@ def _report(
 
 def _pose_stds(best: Candidate, inputs: Inputs) -> tuple[dict[str, float], dict[str, float]]:
     """Return the standard deviations of optical centres [% of their extent], at most 100, and rotations [deg], 180."""
-    centers, turns = pose_stds(*_estimated(best, inputs))
+    centers, turns = pose_stds(*_estimated(best, inputs), noise_px=best.noise_px)
     return (
         {image: round(min(100.0 * std, 100.0), 4) for image, std in centers.items()},
         {image: round(min(float(np.degrees(std)), 180.0), 3) for image, std in turns.items()},
@@ -370,7 +370,7 @@ def _uncertain_centers(stds_percent: dict[str, float]) -> list[str]:
     worst = max(uncertain, key=lambda image: stds_percent[image])
     return [
         f"the optical centres of {len(uncertain)} of {len(stds_percent)} registered images are less certain than "
-        f"{100.0 * UNCERTAIN_CENTER:g} % of their extent ({worst}: {stds_percent[worst]:.1f} %): few matches tie them "
+        f"{100.0 * UNCERTAIN_CENTER:g} % of their extent ({worst}: {stds_percent[worst]:.2g} %): few matches tie them "
         "to the others, or the lens is long; more photos between them, surroundings with texture or known intrinsics "
         "([[calibration.intrinsics]]) make them certain"
     ]
@@ -383,7 +383,7 @@ def _uncertain_rotations(stds_deg: dict[str, float]) -> list[str]:
     worst = max(uncertain, key=lambda image: stds_deg[image])
     return [
         f"the rotations of {len(uncertain)} of {len(stds_deg)} registered images are less certain than "
-        f"{UNCERTAIN_ROTATION_DEG:g} deg ({worst}: {stds_deg[worst]:.1f} deg): few matches tie them to the others, or "
+        f"{UNCERTAIN_ROTATION_DEG:g} deg ({worst}: {stds_deg[worst]:.2g} deg): few matches tie them to the others, or "
         "tell a rotation from a principal point off the middle; known intrinsics ([[calibration.intrinsics]]) and more "
         "texture around the object make them certain"
     ]

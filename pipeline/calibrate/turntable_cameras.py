@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .bundle import POSE, all_errors_px, errors_px
+from .bundle import POSE, all_errors_px
 from .camera_models import LENS_PARAMETERS, focal_numbers, robust_cost, supported
-from .mapping import LOSS_SCALE, noise_px
+from .mapping import LOSS_SCALE
+from .observation_noise import noise_px
 from .reconstruction import Array, SfmCamera, SfmModel, VerifiedPair
 from .turntable_adjustment import adjusted
 from .turntable_motion import TurntableMotion, turntable_motion
@@ -156,7 +157,7 @@ def _weights(model: SfmModel, wanted: Map[str, str], focals: Focals, noise: floa
 
 def _without_outliers(model: SfmModel, limit_px: float) -> SfmModel:
     """Drop observations with larger errors, and points that fewer than two are left of."""
-    good = {image: errors_px(model, image) <= limit_px for image in model.T_cam_world}
+    good = {image: model.errors_px(image) <= limit_px for image in model.T_cam_world}
     kept = {image: (xy[good[image]], seen[good[image]]) for image, (xy, seen) in model.observations.items()}
     count = np.bincount(np.concatenate([seen for _, seen in kept.values()]), minlength=len(model.points))
     return replace(model, observations=kept).with_points(count >= 2)

@@ -6,14 +6,17 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pycolmap
 import pytest
 from cgwm.pipeline.calibrate import attempts, pose_posterior
 from cgwm.pipeline.calibrate.camera_models import LADDER
 from cgwm.pipeline.calibrate.center_uncertainty import center_stds, pose_stds
+from cgwm.pipeline.calibrate.mapping import Mapped, adjusted, without_outliers
 from cgwm.pipeline.calibrate.metric_scale import umeyama
+from cgwm.pipeline.calibrate.observation_noise import noise_by_image
 from cgwm.pipeline.calibrate.pose_posterior import posterior, principal_points
 from cgwm.pipeline.calibrate.reconstruction import SfmModel, Similarity
-from helpers.sfm_scene import make_scene, rotation_about
+from helpers.sfm_scene import look_at, make_scene, rotation_about
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -61,6 +64,7 @@ def _adjusted(model: SfmModel) -> SfmModel:
 @pytest.mark.evidence  # 40 bundle adjustments by finite differences
 def test_equals_the_scatter_of_adjustments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pose_posterior, "SHARED_VARIANCE", 1.0)
+    monkeypatch.setattr(pose_posterior, "HIDDEN_VARIANCE", 1.0)
     monkeypatch.setattr(pose_posterior, "PRINCIPAL_STD", 1e-6)  # the scene's is in the middle
     model = _scene()
     true, extent = model.centers(), np.linalg.norm(np.ptp(model.centers(), axis=0))
@@ -208,3 +212,63 @@ def test_known_intrinsics_make_centres_more_certain() -> None:
 def test_cameras_that_nothing_determines_are_infinitely_uncertain() -> None:
     model = _scene(points=3)
     assert all(std == np.inf or std > 1.0 for std in center_stds(model, {"photos": "OPENCV"}).values())
+
+
+def test_noise_by_image_is_that_of_each_image_and_doubles_the_stated_errors() -> None:
+    model = _scene(images=8, points=200)
+    rng, levels = np.random.default_rng(0), [0.2, 0.2, 0.6, 0.2, 0.4, 0.2, 0.2, 0.1]
+    noise = dict(zip(model.T_cam_world, levels, strict=True))
+    seen = {name: (xy + rng.normal(0, noise[name], xy.shape), at) for name, (xy, at) in model.observations.items()}
+    found = noise_by_image(replace(model, observations=seen))  # of a model that no fit has bent to its observations
+    free = 1.0 - (6 + 3 * 200 / 8) / 400
+    assert np.array(list(found.values())) * np.sqrt(free) == pytest.approx(levels, rel=0.12)
+    once = pose_stds(model, {}, noise_px={name: 0.5 for name in model.T_cam_world})
+    twice = pose_stds(model, {}, noise_px={name: 1.0 for name in model.T_cam_world})
+    for small, large in zip(once, twice, strict=True):
+        assert list(large.values()) == pytest.approx(2 * np.array(list(small.values())), rel=1e-6)
+    one = next(iter(model.T_cam_world))
+    more = pose_stds(model, {}, noise_px={name: 1.5 if name == one else 0.5 for name in model.T_cam_world})[0]
+    assert more[one] > 2 * once[0][one] and max(more[name] / once[0][name] for name in more if name != one) < 1.5
+
+
+@pytest.mark.evidence  # 24 adjustments of ten photos; that the noise is each image's is a law above
+def test_a_photo_with_few_observations_is_as_uncertain_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of its fourteen observations half agree with a wrong pose by chance, and the others were dropped as wrong."""
+    monkeypatch.setattr(pose_posterior, "SHARED_VARIANCE", 1.0)
+    monkeypatch.setattr(pose_posterior, "HIDDEN_VARIANCE", 1.0)
+    lens, off = {"photos": "SIMPLE_PINHOLE"}, []
+    for seed in range(12):
+        start, centers = _long_tails(seed)
+        kept = without_outliers(adjusted(start, lens, {}, 0), {}, 0)
+        model = kept.model()
+        similarity = umeyama(model.centers(), centers)
+        error = np.linalg.norm(similarity.points(model.centers())[0] - centers[0]) / np.linalg.norm(np.ptp(centers, 0))
+        stated = (pose_stds(model, lens, noise_px=noise)[0]["00.jpg"] for noise in (None, kept.noise_px))
+        off.append([error / std for std in stated])
+    left, before = np.sqrt(np.square(off).mean(0))
+    assert left > 2.0 and 0.6 < before < 1.5  # 12 draws: the standard error of a root mean square is about 15 %
+
+
+def _long_tails(seed: int) -> tuple[Mapped, np.ndarray]:
+    """Return cameras with true poses, of which the first sees few points, and centres; features have two noises."""
+    rng, count, points = np.random.default_rng(seed), 8, 150
+    model, cloud = pycolmap.Reconstruction(), rng.uniform(-0.6, 0.6, (points, 3))
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=[600.0, 320.0, 240.0], camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    tracks, centers = [pycolmap.Track() for _ in cloud], []
+    for k in range(count):
+        angle = 2 * np.pi * k / count
+        centers.append(1.6 * np.array([np.cos(angle), np.sin(angle), rng.uniform(-0.2, 0.6)]))
+        pose = look_at(centers[-1], rng.normal(0, 0.1, 3))
+        local = cloud @ pose[:3, :3].T + pose[:3, 3]
+        noise = np.where(rng.random(points) < (0.4 if k else 0.6), 0.6, 0.08)
+        pixels = 600.0 * local[:, :2] / local[:, 2:] + [320.0, 240.0] + rng.normal(size=(points, 2)) * noise[:, None]
+        seen = rng.permutation(points)[: points if k else 14]
+        places = pycolmap.Point2DList([pycolmap.Point2D(pixels[index]) for index in seen])
+        image = pycolmap.Image(name=f"{k:02d}.jpg", camera_id=1, image_id=k + 1, points2D=places)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+        for place, index in enumerate(seen):
+            tracks[index].add_element(k + 1, place)
+    for position, track in zip(cloud, tracks, strict=True):
+        model.add_point3D(position, track, np.zeros(3, np.uint8))
+    return Mapped(reconstruction=model, names={1: "photos"}), np.array(centers)
