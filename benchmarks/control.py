@@ -14,9 +14,9 @@ proposals of pushes, over it; `open loop`: the commands that cgwm finds in its m
 behind, straight to the goal, then turns.
 
 With `--fits`, FOLDER/<object> is what `cgwm demo --scene control` has written (box: seed 0, l_block: 2,
-hexagonal_prism: 3, t_block: 4), whose task is taken. `fitted` has the model of the photos and the video, `fitted +
-draws` judges plans under four draws of what that fit is unsure of, `true` has the true shape and numbers. The plants
-have the errors of `PLANTS`, which no controller knows.
+hexagonal_prism: 3, t_block: 4) or, for the mug, `fitted_mug.py`; its task is taken. `fitted` has the model of the
+photos and the video, `fitted + draws` judges plans under four draws of what that fit is unsure of, `true` has the true
+shape and numbers. The plants have the errors of `PLANTS`, which no controller knows.
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ from cgwm.schemas import (
 )
 from processor_clock import charge_processors
 from store import Store, shared_data
+from tabletop.objects import load_item
 
 OBJECTS = ("t_block", "box", "l_block", "mug")
 FRICTION, FINGER_FRICTION = 0.35, 0.3
@@ -105,12 +106,17 @@ def scene(name: str, folder: Path, fits: Path | None = None) -> Scene:
         folder: Where its parts are written.
         fits: Folder of fits; None for none.
     """
-    if name == "mug":
+    if name == "mug" and fits is None:
         parts, mass, down = _mug(folder)
         meshes = tuple(path.name for path in parts)
         every = [read_mesh(path) for path in parts]
         spheres = [distil(mesh_volume(part), SPHERES // len(parts)) for part in every]
         centers, radii = (np.concatenate([getattr(one, key) for one in spheres]) for key in ("centers", "radii"))
+    elif name == "mug":
+        item, meshes = load_item(name), ()  # that of `fitted_mug.py`; the task names its parts
+        every, mass, down = [Mesh(item.solid.vertices, item.solid.faces)], item.solid.mass, item.down
+        found = distil(mesh_volume(every[0]), SPHERES)
+        centers, radii = found.centers, found.radii
     else:
         solid = make_object(FAMILIES.index(name))
         every = [_hull(part) for part in solid.parts]
@@ -148,7 +154,7 @@ def _body(parts: list[Mesh], mass: float, down: np.ndarray, spheres: Splats) -> 
         inertia_kg_m2=six,  # pyright: ignore[reportArgumentType]
         com_m=tuple(map(float, com)),  # pyright: ignore[reportArgumentType]
         photo_pose=Pose(position_m=(0.0, 0.0, 0.05), quat_wxyz=quat),
-        convex=len(parts) == 1,
+        convex=len(parts) == 1 and len(parts[0].vertices) == len(_hull(parts[0].vertices).vertices),
     )
     return body, spheres
 
