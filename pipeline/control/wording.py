@@ -42,9 +42,9 @@ def sentence(runs: Sequence[ControlRun], task: AnyTask, clock: ClockName) -> str
         times = sorted(run.time_s for run in good)
         words[0] += f", after {times[len(times) // 2]:.1f} s (median)"
     if isinstance(task, HandTask) and task.success.goals > 1:
-        minutes = sum(run.time_s for run in runs) / 60
-        goals = sum(run.goals for run in runs)
-        words.append(f"{goals} goal{'s' * (goals != 1)} in {minutes:.1f} minutes")
+        spent_s, goals = sum(run.time_s for run in runs), sum(run.goals for run in runs)
+        spent = f"{spent_s:.1f} s" if spent_s < 60 else f"{spent_s / 60:.1f} minutes"
+        words.append(f"{goals} goal{'s' * (goals != 1)} in {spent}")
     for kind, text in _ENDS.items():
         count = sum(run.ended == kind for run in runs)
         words += [f"{count} {text}"] if count else []
