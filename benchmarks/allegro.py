@@ -44,7 +44,7 @@ mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs
 FRICTION, FINGER_FRICTION, CONTACT_TIME_S, DAMPING_RATIO = 0.5, 1.0, 0.02, 8.0
 """Those of the scenes; damping as forecasts of runs of development want it: objects and fingers overlap by millimetres
 there, and what overlaps must not be thrown apart."""
-ABOVE_M = 1.0
+ABOVE_M = 0.22
 JOINTS_RAD = (
     0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26,
 )  # fmt: skip
