@@ -70,7 +70,7 @@ class HandController(PlanningController):
         likely = task.planner.risk == "likely"
         worlds = drawn_worlds(model, draws, seed, where, planned, likely)
         tracked = partial(planned, step_s=min(STEP_S, task.planner.step_s))
-        self._tracker = HandTracker(found, drawn_worlds(model, draws, seed, "cpu", tracked, likely))
+        self._tracker = HandTracker(found, drawn_worlds(model, draws, seed, where, tracked, likely))
         super().__init__(task.planner, worlds, solver_of(solver, Elites(task.planner.samples)), where, seed)
 
     def restart(self, seed: int) -> None:
@@ -129,6 +129,9 @@ class HandController(PlanningController):
         )
         believed = self._tracker.update(state, self._sent_since(state))
         lead = self._given(before, state.time_s, acts_s)
+        if acts_s - state.time_s > self.interval_s + 1e-9:  # the planner's own steps do for one command
+            believed = self._tracker.ahead(believed, lead)
+            lead = Targets(times_s=lead.times_s[-1:], values_m=lead.values_m[-1:])
         knots = acts_s + planner.horizon_s / planner.knots * np.arange(1, planner.knots + 1)
         objective = HandObjective(
             hand=hand,

@@ -12,9 +12,11 @@ from torch import Tensor
 
 from ...geometry.rotation import quat_exp, quat_multiply, quat_normalize, quat_turn
 from ...physics.chains.joint_command import JointCommand
+from ...physics.chains.state import joints_of, with_joints
 from ...physics.engine import rollout
+from ...physics.rollout import Rollout
 from ...physics.state import State
-from ..horizon import Targets
+from ..horizon import Array, Targets
 from ..objective import Worlds
 from ..planning import ControlState
 from .world import HandWorld
@@ -26,6 +28,9 @@ STEP_S = 0.004
 DRIFT = (0.0035, math.radians(6.0))
 """Growth of a prediction's error of place [m] and turn [rad], per coordinate and root of a second: 0.5 mm and 0.8 deg
 in 20 ms."""
+FELT = (math.radians(0.4), 0.5)
+"""Standard deviations of what such a prediction lacks of the joints [rad] and of their speeds [rad/s] at its end. They
+are measured without noise, so that a finger that the object stops tells where that is."""
 LONGEST_S = 0.25
 """Time without a state after which the next one is believed as it is [s]."""
 WINDOW_S = 0.2
@@ -82,9 +87,10 @@ class HandTracker:
 
     Noisy poses are filtered by an ensemble Kalman filter (Evensen, "Sequential data assimilation with a nonlinear
     quasi-geostrophic model", 1994): some states are predicted by the model, so that contacts keep them out of the
-    fingers, whose joints are known, and say how pose and velocities vary together. Where there are several draws of the
-    model, each predicts the motion over pieces of `WINDOW_S`. The first, the estimate, is used for the filter and for
-    plans until another one predicted better by more than chance, by the scatter of their differences between pieces.
+    fingers, whose joints are known, and say how pose, velocities and the joints that the object stops vary together.
+    Where there are several draws of the model, each predicts the motion over pieces of `WINDOW_S`. The first, the
+    estimate, is used for the filter and for plans until another one predicted better by more than chance, by the
+    scatter of their differences between pieces.
 
     Args:
         hand: The task.
@@ -156,44 +162,74 @@ class HandTracker:
         """Return the states after a prediction from those before and a measured pose."""
         gone = state.time_s - before.time_s
         position, quat = self._shaken(*before.motion[:2], math.sqrt(gone) * np.array(DRIFT))
-        found = self._predicted(replace(before, position_m=position, quat_wxyz=quat), state, sent)
-        found = _followed(found, *_pose(state), gone) if len(position) == 1 else self._filtered(found, *_pose(state))
+        found, felt = self._predicted(replace(before, position_m=position, quat_wxyz=quat), state, sent)
+        seen = _pose(state)
+        found = _followed(found, *seen, gone) if len(position) == 1 else self._filtered(found, felt, *seen)
         given = {name: getattr(measured, name) for name in VELOCITIES if getattr(state, name) is not None}
         return replace(found, joints=measured.joints, speeds=measured.speeds, time_s=state.time_s, **given)
 
     @torch.no_grad()
-    def _predicted(self, known: _Ensemble, state: ControlState, sent: Targets) -> _Ensemble:
-        """Return the states after the targets, under the best draw; count how well each draw predicts the mean."""
+    def ahead(self, believed: State, sent: Targets) -> State:
+        """Return a state (1, nb, ...) after further targets, predicted in the steps of the filter, with all links."""
+        times = torch.as_tensor(sent.times_s - sent.times_s[0])
+        rows = (self.draw,) if self._worlds.draws > 1 else ()
+        motion = rollout(self._worlds.batch(rows), believed, times[[0, -1]], self._commanded(times, sent))
+        return _end_of(motion)
+
+    def _commanded(self, times_s: Tensor, sent: Targets) -> dict[str, JointCommand]:
+        return {self._hand.chain.name: JointCommand.targets(times_s[None], torch.as_tensor(sent.values_m)[None])}
+
+    @torch.no_grad()
+    def _predicted(self, known: _Ensemble, state: ControlState, sent: Targets) -> tuple[_Ensemble, Array]:
+        """Return the states after the targets, under the best draw; count how well each draw predicts the mean.
+
+        Also returns how far the measured joints and speeds are from predicted ones, in units of `FELT`, shape (states,
+        joints and speeds); of one state alone none.
+        """
         count, draws, thing = len(known.position_m), self._worlds.draws, self._hand.object
         rows = (self.draw,) * count + tuple(range(draws)) if draws > 1 else ()
         trial = self._trial or _Trial(known.time_s, tuple(mean.expand(draws, -1) for mean in known.mean))
         parts = [torch.cat((part, tried)) if draws > 1 else part
                  for part, tried in zip(known.motion, trial.motion, strict=True)]  # fmt: skip
-        base = self._hand.state(parts[0][0], parts[1][0], known.joints, speeds=known.speeds)
+        base = self._hand.state(parts[0][0], parts[1][0], {}, placed=False)
         start = State(*(part.expand(len(parts[0]), *part.shape[1:]).clone() for part in base.tensors))
         for whole, part in zip(start.tensors, parts, strict=True):
             whole[:, thing] = part
+        start = with_joints(self._hand.world, start, known.joints, known.speeds, placed=False)
         times = torch.as_tensor(sent.times_s - sent.times_s[0])
-        command = JointCommand.targets(times[None], torch.as_tensor(sent.values_m)[None])
-        motion = rollout(self._worlds.batch(rows), start, times[[0, -1]], {self._hand.chain.name: command})
-        every = (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
-        position, quat, velocity, omega = (part[:, -1, thing] for part in every)
+        motion = rollout(self._worlds.batch(rows), start, times[[0, -1]], self._commanded(times, sent))
+        end = _end_of(motion)
+        position, quat, velocity, omega = (part[:, thing] for part in end.tensors)
         if draws > 1:
-            self._tried(replace(trial, motion=tuple(part[count:, -1, thing] for part in every)), state)
+            self._tried(replace(trial, motion=tuple(part[count:, thing] for part in end.tensors)), state)
+        felt = self._felt(State(*(part[:count] for part in end.tensors)), state) if count > 1 else np.zeros((count, 0))
         return replace(known, position_m=position[:count], quat_wxyz=quat[:count], velocity_m_s=velocity[:count],
-                       omega_body_rad_s=omega[:count])  # fmt: skip
+                       omega_body_rad_s=omega[:count]), felt  # fmt: skip
 
-    def _filtered(self, found: _Ensemble, position_m: Tensor, quat_wxyz: Tensor) -> _Ensemble:
-        """Return predicted states after a measured pose (1, ...), by the gains of the ensemble's covariance."""
+    def _felt(self, end: State, state: ControlState) -> Array:
+        """Return how far the measured joints are from those of predicted states, see `_predicted`."""
+        found = joints_of(self._hand.world, end, self._hand.chain, exact=False)
+        away = [
+            (torch.tensor([given[name] for name in self._hand.joints]) - part) / size
+            for given, part, size in zip((state.joints, state.joint_speeds), found, FELT, strict=True)
+            if given is not None
+        ]
+        return torch.cat(away, -1).numpy()
+
+    def _filtered(self, found: _Ensemble, felt: Array, position_m: Tensor, quat_wxyz: Tensor) -> _Ensemble:
+        """Return predicted states after a measured pose (1, ...) and joints, by the gains of the ensemble's covariance.
+
+        All measurements are in units of their standard deviations.
+        """
         middle = found.mean[1]
         rows = torch.cat((found.position_m, quat_turn(middle, found.quat_wxyz), found.velocity_m_s,
                           found.omega_body_rad_s), -1).numpy()  # fmt: skip
-        size = np.repeat(self._noise, 3)
-        covariance = np.cov(rows.T)
-        gain = np.linalg.solve(covariance[:6, :6] + np.diag(size**2), covariance[:6]).T
         seen = torch.cat((position_m, quat_turn(middle, quat_wxyz)), -1).numpy()
-        errors = size * self._rng.normal(size=(len(rows), 6))
-        rows = torch.as_tensor(rows + (seen + errors - errors.mean(0) - rows[:, :6]) @ gain.T)
+        away = np.concatenate(((seen - rows[:, :6]) / np.repeat(self._noise, 3), felt), -1)
+        covariance, size = np.cov(np.concatenate((rows, -away), -1).T), rows.shape[1]
+        gain = np.linalg.solve(covariance[size:, size:] + np.eye(away.shape[1]), covariance[size:, :size]).T
+        errors = self._rng.normal(size=away.shape)
+        rows = torch.as_tensor(rows + (away + errors - errors.mean(0)) @ gain.T)
         quat = quat_multiply(middle.expand(len(rows), 4), quat_exp(rows[:, 3:6]))
         return replace(
             found, position_m=rows[:, :3], quat_wxyz=quat, velocity_m_s=rows[:, 6:9], omega_body_rad_s=rows[:, 9:]
@@ -217,6 +253,12 @@ class HandTracker:
         kept, behind = math.exp(-gone_s / MEMORY_S), each - each[0]
         self._behind = self._behind * kept + behind
         self._scatter = self._scatter * kept**2 + behind**2
+
+
+def _end_of(motion: Rollout) -> State:
+    """Return the last state of a motion."""
+    every = (motion.position_m, motion.quat_wxyz, motion.velocity_m_s, motion.omega_body_rad_s)
+    return State(*(part[:, -1] for part in every))
 
 
 def _pose(state: ControlState) -> tuple[Tensor, Tensor]:

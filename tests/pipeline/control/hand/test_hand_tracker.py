@@ -112,3 +112,20 @@ def test_late_states_are_predicted_by_what_was_sent(unsure: tuple[Path, Model]) 
     given = controller._given(later, 0.05, 0.25)
     np.testing.assert_allclose(given.times_s, [0.05, 0.1, 0.2, 0.25])
     np.testing.assert_allclose(given.values_m[:, 0], [0.1, 0.2, 0.1, 0.3])
+
+
+def test_a_plan_for_late_states_begins_where_what_was_sent_takes_them(unsure: tuple[Path, Model]) -> None:
+    controller = HandController(unsure[1], hand_task(unsure[0]))
+    plant, interval, names = HandModelPlant(controller.hand), controller.interval_s, controller.joints
+    truths = [plant.reset(*hand_start(controller.task, 0))]
+    controller.note_sent(0.0, dict(zip(names, controller.hand.home, strict=True)))
+    for number in range(1, 11):
+        target = np.array([min(0.05 * number, 1.2), 0.0])
+        controller.note_sent(number * interval, dict(zip(names, target, strict=True)))
+        truths.append(plant.advance(target, interval))
+    old, now = truths[6], truths[10]
+    state = old.measured(6 * interval, old.position_m, old.quat_wxyz)
+    objective, _ = controller._objective(state, 10 * interval)
+    assert objective.times_s[0] == objective.acts_s == pytest.approx(10 * interval)
+    np.testing.assert_allclose(objective.state.position_m[0, -1].numpy(), now.position_m, atol=5e-4)
+    assert np.linalg.norm(now.position_m - old.position_m) > 0.005  # it was pushed meanwhile
