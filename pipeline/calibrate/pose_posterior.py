@@ -11,8 +11,8 @@ shifts with the direction of view, and what all observations of a place have in 
 residual shows it, and no scatter between parts of the points does.
 
 The noise sigma is that of each image's observations before those far off were dropped (`observation_noise`): what is
-left agrees with the cameras by selection. Where it is not given, one noise of the residuals stands for all images, with
-a factor for what dropping hides.
+left agrees with the cameras by selection. It is at least the noise of the residuals of all images, with a factor for
+what dropping hides.
 
 What a camera model leaves out is not known to be zero: where it has no distortion, k1 has a prior.
 """
@@ -29,7 +29,7 @@ from .bundle import POSE, PRINCIPAL, ReducedEquations, all_errors_px, linearized
 from .camera_models import LADDER, LENS_PARAMETERS
 from .focal_prior import EXIF_STD
 from .mapping import LOSS_SCALE
-from .observation_noise import LEAST_NOISE_PX, noise_by_image
+from .observation_noise import LEAST_NOISE_PX
 from .observation_noise import noise_px as common_noise_px
 from .reconstruction import Array, SfmModel
 from .triangulation import cross_matrices
@@ -39,8 +39,7 @@ SHARED_VARIANCE = 2.0
 """Variance of the errors of poses, in units of that of independent errors: calibrated on photos of scanned objects with
 known cameras ([Thresholds](../../docs/thresholds.md))."""
 HIDDEN_VARIANCE = 2.0
-"""Variance of the observations of a model, in units of what the residuals of those that were kept show of it: it stands
-for the noise by image where that is not given."""
+"""Variance of observations, in units of what the residuals of those that were kept show of it."""
 
 PRINCIPAL_STD = 0.005
 """Standard deviation of a coordinate of the principal point about the middle, as a fraction of the picture's diagonal:
@@ -112,8 +111,8 @@ def posterior(
         models: COLMAP's camera model of each camera whose intrinsics were estimated.
         with_exif: Those cameras among them whose focal length EXIF data have told, too.
         motion: The turntable that the poses were constrained to, whose axis is z; the numbers are then those of it.
-        noise_px: Noise of observations by image [px], before some were dropped; None takes one for all images, that of
-            the observations that the model has.
+        noise_px: Noise of observations by image [px], before some were dropped; where it is less, and for None, all
+            images have one, that of the observations of the model with what dropping hides.
     """
     found = _solved(model, models, with_exif, motion, noise_px)
     return Posterior(
@@ -168,17 +167,19 @@ def _solved(
     noise_px: Map[str, float] | None,
 ) -> _Solution:
     lengths = all_errors_px(model)
-    by_image = None if noise_px is None else _noise_by_image(model, noise_px)
+    weights = _weights(lengths)
     lenses = {camera: max(name, "SIMPLE_RADIAL", key=LADDER.index) for camera, name in models.items()}
-    loss_px = LOSS_SCALE * (common_noise_px(lengths) if by_image is None else 1.0)
+    size = POSE * len(model.T_cam_world) + sum(LENS_PARAMETERS[lens] + PRINCIPAL for lens in lenses.values())
+    design = np.eye(size) if motion is None else _design(model, motion, size)
+    shown_px = float(np.sqrt(HIDDEN_VARIANCE)) * _noise_px(model, lengths, weights, design.shape[1])
+    by_image, loss_px, variance = None, LOSS_SCALE * common_noise_px(lengths), shown_px**2
+    if noise_px is not None and np.isfinite(shown_px):
+        by_image = {image: max(shown_px, noise_px.get(image, 0.0)) for image in model.T_cam_world}
+        loss_px, variance = LOSS_SCALE, 1.0  # errors are multiples of the noise
     reduced = linearized(model, lenses, loss_px, principal=True, noise_px=by_image).reduced()
     focal = reduced.whole.columns
     principal = {camera: column + LENS_PARAMETERS[lenses[camera]] for camera, column in focal.items()}
-    size = len(reduced.matrix)
-    design = np.eye(size) if motion is None else _design(model, motion, size)
-    weights = _weights(lengths)
-    shown = HIDDEN_VARIANCE * _noise_px(model, lengths, weights, design.shape[1]) ** 2 if by_image is None else 1.0
-    scale = 1.0 / (SHARED_VARIANCE * shown)
+    scale = 1.0 / (SHARED_VARIANCE * variance)
     # the loss is curved less than its weights say, by sum w^2 / sum w for Cauchy's; steps are longer by as much
     information, pull = scale * reduced.matrix, scale * reduced.right * (weights.sum() / (weights**2).sum())
     for camera, column in principal.items():
@@ -201,11 +202,6 @@ def _solved(
         loss_px=loss_px,
         noise_px=by_image,
     )
-
-
-def _noise_by_image(model: SfmModel, noise_px: Map[str, float]) -> dict[str, float]:
-    """Return the noise of each image's observations: at least that of those which the model has."""
-    return {image: max(own, noise_px.get(image, 0.0)) for image, own in noise_by_image(model).items()}
 
 
 def _inverse(information: Array) -> Array:
