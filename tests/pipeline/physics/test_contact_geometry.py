@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import simulate
 from cgwm.pipeline.physics.body import Body
 from cgwm.pipeline.physics.checks import overlaps
-from cgwm.pipeline.physics.contact_detection import Placed, all_body_points
+from cgwm.pipeline.physics.contact_detection import Placed, _gap_along, all_body_points
 from cgwm.pipeline.physics.edge_contact import Crossings, Edges, best_normal
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.hull import Hull, hull_distance
@@ -175,3 +176,18 @@ def test_the_normal_between_opposite_spheres_is_a_unit_vector() -> None:
 def test_bodies_surfaces_and_the_ground_are_named() -> None:
     world = world_of(box_body(), ball_body(0.04, name="ball"))
     assert [world.named(k) for k in (-1, 0, 1)] == ["the ground", "body 'box'", "body 'ball'"]
+
+
+def test_the_gap_along_a_normal_is_that_between_the_spheres_that_reach_farthest() -> None:
+    along = torch.tensor([[1.0, 0.0, 0.0]], dtype=F64)
+    left, right = (
+        SimpleNamespace(centers=lambda x=x: batch(x), radii=lambda r=r: batch(r))
+        for x, r in (([[0.0, 0, 0], [0.1, 0, 0]], [0.3, 0.05]), ([[1.0, 0, 0], [0.9, 5.0, 0]], [0.2, 0.05]))
+    )
+    assert float(_gap_along(left, right, along)) == pytest.approx(0.8 - 0.3)  # pyright: ignore[reportArgumentType]
+
+
+def test_depth_is_measured_from_where_the_ground_lies() -> None:
+    world = replace(world_of(ball_body(0.04)), ground_offset=batch(0.5))
+    (found,) = overlaps(world, state_of(((0, 0, 0.533), UP, (0, 0, 0), (0, 0, 0))))
+    assert float(found.depth_m) == pytest.approx(0.007, abs=1e-12)

@@ -1,13 +1,16 @@
 """What a world keeps of itself."""
 
+import math
 from dataclasses import replace
 
+import pytest
 import torch
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.physics.world import World
 from helpers.small_model import small_model
+from helpers.worlds import ball_body, batch, world_of
 
 
 def test_what_depends_on_the_world_alone_is_made_once_for_each_world() -> None:
@@ -50,3 +53,9 @@ def test_a_convex_body_alone_on_the_ground_has_no_hull_and_moves_as_with_one() -
     moved = [rollout(world, start, times) for world in (bare, hulled)]
     assert torch.equal(moved[0].position_m, moved[1].position_m) and moved[0].position_m[0, -1, 0, 2] < 0.09
     assert torch.equal(moved[0].quat_wxyz, moved[1].quat_wxyz)
+
+
+@pytest.mark.parametrize("gravity", [(0.3, 0.0, -0.4), (0.0, 0.0, -9.81)])
+def test_up_is_a_unit_vector_against_gravity_however_weak(gravity: tuple[float, float, float]) -> None:
+    world = replace(world_of(ball_body()), gravity=batch(list(gravity)))
+    torch.testing.assert_close(world.up, -world.gravity / math.hypot(*gravity))

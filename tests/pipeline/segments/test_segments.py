@@ -7,6 +7,7 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics.parameters import Parameter
+from cgwm.pipeline.segments import segments as segments_module
 from cgwm.pipeline.segments.first_contact_fit import MAX_WINDOWS, _prior, windows_of
 from cgwm.pipeline.segments.held_out_gain import HeldOutGain
 from cgwm.pipeline.segments.segment_fit import Linear, Refit, robust_excess
@@ -151,3 +152,11 @@ def test_a_line_goes_through_what_counts_of_it() -> None:
         torch.testing.assert_close(found[:, k], wanted)
     nothing = _line(t, noisy, torch.zeros_like(weight))
     assert all(bool((part == 0).all()) for part in nothing)
+
+
+def test_chunks_hold_each_segment_once_and_as_many_variations_as_are_rolled_at_once(monkeypatch) -> None:
+    many = _flight().select([0] * 7)
+    monkeypatch.setattr(segments_module, "rollouts_at_once", lambda world: 10)
+    chunks = many.chunks(4)
+    assert [k for chunk in chunks for k in chunk] == list(range(7))
+    assert len(chunks) == 3 and all(4 * len(chunk) <= 12 for chunk in chunks)

@@ -1,8 +1,10 @@
 """Intervals of effects beside the scales of lengths that sessions have of their own."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from cgwm.pipeline.segments.session_spread import Joint, beside
+from cgwm.pipeline.segments.session_spread import Joint, _joined, beside
 
 TRUE, ERROR, DRAWS = 0.01, 1e-3, 100
 
@@ -45,3 +47,14 @@ def test_a_session_counts_once_however_many_its_episodes() -> None:
     step, _, spread = beside(joint, 0.05)
     assert mean + step[0] == pytest.approx(0.0, abs=1e-4) and step[1] - step[2] == pytest.approx(0.02, rel=1e-2)
     assert spread == pytest.approx((3e-3**2 / 2 + 0.02**2 / 2 / 2) ** 0.5, rel=0.02)
+
+
+def test_each_session_has_a_scale_of_its_own_and_priors_count_by_their_variance() -> None:
+    widths = (0.5, 2.0)
+    parameters = [SimpleNamespace(prior=(0.0, width)) for width in widths]
+    slopes = np.random.default_rng(3).normal(size=(3, 3))
+    information, score = slopes[:, :, None] * slopes[:, None], slopes
+    joint = _joined(information, score, np.array([4, 4, 9]), np.array([0, 0, 1]), parameters)  # pyright: ignore[reportArgumentType]
+    assert np.allclose(joint.prior, [4.0, 0.25])
+    assert np.allclose(joint.score, [[*slopes[:2].sum(0), 0.0], [*slopes[2, :2], 0.0, slopes[2, 2]]])
+    assert np.allclose(joint.information[1, 3], [*information[2, 2, :2], 0.0, information[2, 2, 2]])

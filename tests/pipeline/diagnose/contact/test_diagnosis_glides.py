@@ -16,7 +16,7 @@ from cgwm.pipeline.diagnose.evidence.score_test import ScoreTest
 from cgwm.pipeline.diagnose.thresholds import THRESHOLDS
 from cgwm.pipeline.diagnose.verdict import Findings, find
 from cgwm.pipeline.geometry.rotation import quat_to_matrix
-from cgwm.pipeline.physics import World
+from cgwm.pipeline.physics import World, simulate
 from cgwm.pipeline.physics.contact_law import ContactLaw
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.parameters import FRICTION
@@ -24,11 +24,12 @@ from cgwm.pipeline.segments.candidates import Candidate
 from cgwm.pipeline.segments.prepare import Prepared, prepare
 from cgwm.pipeline.segments.segments import Segments
 from cgwm.pipeline.segments.sliding.fit import StartedSliding
-from cgwm.pipeline.segments.sliding.residuals import LoadErrors, soft_world
+from cgwm.pipeline.segments.sliding.residuals import TIME_S, LoadErrors, soft_world
 from cgwm.pipeline.segments.sliding.segments import find_sliding_segments
 from cgwm.pipeline.trajectories.segmentation import Segment
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.diagnosis_data import Effects, tosses, world_with
+from helpers.worlds import ball_body, state_of, world_of
 
 LIBRARY = [
     Candidate(name, load_effect(name))
@@ -348,3 +349,10 @@ def test_what_unknown_loads_turn_is_no_evidence() -> None:
         share = loads.whitened(given[None]).norm() / given.norm()
         assert least <= share <= most
     assert weak.norm() <= full.norm()
+
+
+def test_a_body_rests_on_the_soft_ground_nearly_as_high_as_on_the_hard_one() -> None:
+    start = state_of(((0, 0, 0.04), (1, 0, 0, 0), (0, 0, 0), (0, 0, 0)))
+    every = torch.tensor([0.0, 0.05, 0.1], dtype=torch.float64)
+    height = simulate(soft_world(world_of(ball_body(0.04))), start, every).position_m[0, -1, 0, 2]
+    assert abs(float(height) - 0.04) < 0.6 * 9.81 * TIME_S**2  # steps of half its time leave half of the depth

@@ -597,3 +597,14 @@ def test_a_drawer_is_pushed_by_its_losses_and_what_it_cannot_yield_to_does_not_a
     force = found.contacts.impulse_n_s[0, -1][acting].sum(0) / 0.012
     np.testing.assert_allclose(force.abs().amax(), 2.0 + 8.0 * 0.2, rtol=0.02)  # along the normal: dry and viscous
     assert [p.name for p in chain_parameters(world)] == ["rail.damping", "rail.friction"]  # a slide turns nothing
+
+
+def test_the_inertia_of_a_drive_adds_to_the_mass_of_its_joint_alone() -> None:
+    still, values = torch.zeros(1, 3, dtype=F64), torch.tensor([[0.3, -0.7]], dtype=F64)
+    motion = ChainMotion(still, batch([1.0, 0.0, 0.0, 0.0]), still, still, values, 0 * values)
+    plain, geared = (
+        ChainDynamics(chain, tuple(bodies)).balance(motion, batch([0.0, 0.0, -9.81]))
+        for chain, bodies in (double_pendulum(), double_pendulum(armature=0.05))
+    )
+    torch.testing.assert_close(geared.mass - plain.mass, 0.05 * torch.eye(2, dtype=F64)[None])
+    torch.testing.assert_close(geared.bias, plain.bias)

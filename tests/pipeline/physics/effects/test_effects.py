@@ -657,3 +657,14 @@ def test_unknown_numbers_of_an_effect_are_refused() -> None:
         active("linear_drag", k=1.0)
     numbers = active("ground_magnet").values
     assert {name: float(value) for name, value in numbers.items()} == {"A": 0.0, "l": 0.05}
+
+
+@pytest.mark.parametrize("name", ["adhesion", "ground_magnet"])
+def test_what_acts_near_the_ground_does_not_depend_on_where_the_ground_lies(name: str) -> None:
+    ball, values, force = ball_body(0.04), dict.fromkeys(("F", "g", "A", "l"), batch(0.02)), []
+    for offset in (0.0, 0.7):
+        world = replace(world_of(ball), ground_offset=batch(offset))
+        motion = motion_at(world, state_of(((0.0, 0.0, offset + 0.045), UP, (0, 0, 0), (0, 0, 0))))
+        force.append(load_effect(name).wrench(values, motion).force)
+    torch.testing.assert_close(force[1], force[0])
+    assert float(force[0][0, 2].abs()) > 1e-6
