@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ sys.path.insert(0, str(BENCHMARKS))  # as `python benchmarks/engine_page.py` has
 try:
     import budget_page
     import engine_page
+    import few_photos
     from tabletop.draft import Draft
 finally:
     sys.path.remove(str(BENCHMARKS))
@@ -73,3 +75,43 @@ def test_a_draft_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert np.array_equal(known, beginnings[0]) and empty == rejected
     assert np.array_equal(other.standard_normal(5), rng.standard_normal(5))
     assert Draft().read(other, empty) == []
+
+
+def test_the_gain_with_few_photos_is_paired_by_capture() -> None:
+    def measured(photos: str, two: float, joint: float) -> dict[str, object]:
+        values = {"two stages": two, "joint": joint, "floor": 20.0}
+        rows = {
+            name: {"psnr_object_db": [[v, None], [v, v + 2]], "translation_mm": [v], "rotation_deg": [v]}
+            for name, v in values.items()
+        }
+        return {"photos": photos, "rows": rows}
+
+    stored = [measured("4 photos", 15.0, 16.0), measured("4 photos", 11.0, 12.0), measured("8 photos", 11.0, 12.0)]
+    assert few_photos.curves(stored, "4 photos")["joint"] == [
+        14.0,
+        16.0,
+    ]  # a frame that one motion lacks is the others'
+    assert few_photos.gain(stored, "4 photos", "psnr_object_db", "joint", "two stages") == (1.0, 1.0, 1.0)
+    assert few_photos.gain(stored, "8 photos", "translation_mm", "two stages", "floor") == (-9.0, -9.0, -9.0)
+    assert few_photos.chart(stored).count("<polyline points") == 2 * 3 + 3  # and the legend
+    assert few_photos.table(stored).count("\n") == 3
+
+
+def test_photos_are_left_out_evenly_with_their_cameras(tmp_path: Path) -> None:
+    whole, kept = tmp_path / "capture", tmp_path / "few"
+    for folder in ("images", "masks"):
+        (whole / folder).mkdir(parents=True)
+    names = [f"{k:03d}.jpg" for k in range(10)]
+    for name in names:
+        (whole / "images" / name).touch()
+        (whole / "masks" / name.replace("jpg", "png")).touch()
+    (whole / "cameras.json").write_text(json.dumps({"images": {key: {} for key in names}, "videos": {"left": {}}}))
+    chosen = ["000.jpg", "003.jpg", "006.jpg", "009.jpg"]
+    assert few_photos.keep_photos(whole, kept, 4) == chosen
+    assert sorted(path.name for path in (kept / "images").iterdir()) == chosen
+    assert len(list((kept / "masks").iterdir())) == 4
+    assert json.loads((kept / "cameras.json").read_text()) == {
+        "images": {key: {} for key in chosen},
+        "videos": {"left": {}},
+    }
+    assert len(json.loads((whole / "cameras.json").read_text())["images"]) == 10
