@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from torch import Tensor
 from ....datasets.capture.tracks import Episode
 from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
 from ...physics.chains.parameters import LOSSES, chain_parameters, mass_factor
-from ...physics.parameters import GAP, Parameter, gap_parameters
+from ...physics.parameters import GAP, gap_parameters
 from ...physics.world import World
 from ...trajectories.initial_state import clearance
 from ...trajectories.observations import Observations
@@ -40,7 +40,7 @@ from ...trajectories.track_noise import Noise, estimate_noise
 from .driven_result import DrivenFit, Pressed
 from .force_driven import LOADED, ForceDriven, Grid
 from .force_intervals import impulse_variance, kicked_intervals, parts_of_force, senses_of_motion
-from .joint_losses import FLAT, ITERATIONS, ROBUST_SCALE, TOLERANCE, by_differences, information_root, starts, takes
+from .joint_losses import FLAT, ITERATIONS, ROBUST_SCALE, TOLERANCE, JointLosses, information_root, starts, takes
 from .joint_tracks import JointTracks
 from .loss_posterior import posterior
 from .pushed_episodes import APART_M, Pushed, pushed_link, pushes_of, sensor_zero
@@ -77,27 +77,18 @@ def fit_driven_joints(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Data:
-    """Episodes (E) with T frames of J joints, as a least-squares problem."""
+class _Data(JointLosses):
+    """Pushed episodes (E), whose last parameter is the factor of mass; forces act in parts of them."""
 
     pushed: Sequence[Pushed]
-    driven: ForceDriven
-    tracks: JointTracks
-    parameters: Sequence[Parameter]
-    """Losses and the factor of mass (P)."""
-    root: Tensor
-    """Symmetric root of the information of the tracks, shape (E, T, J, J)."""
-    start: tuple[Tensor, Tensor, Tensor, Tensor]
-    """First guess of values and speeds, and the standard deviations of their priors, each (E, J)."""
+    """The episodes."""
     part: Tensor
     """Part of the episode with a force of its own in which each interval is, shape (E, T - 1)."""
     part_std: Tensor
     """Standard deviation of that generalised force, shape (E, parts, J)."""
     late_s: float
     """Standard deviation of the time by which forces are noted too late [s]."""
-    units: Tensor
-    """Units in which losses, in which the motion is linear, are coordinates; 0 for a factor, whose logarithm is one,
-    shape (P,)."""
+    common: ClassVar[int] = len(NOTED)
 
     @staticmethod
     def of(world: World, pushed: Sequence[Pushed], noise: Noise) -> _Data | None:
@@ -138,28 +129,12 @@ class _Data:
             units=torch.tensor([*(p.prior[0] for p in losses), 0.0], dtype=torch.float64),
         )
 
-    def residuals(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
-        """Return residuals (E, T, J) in sigmas and their derivatives (E, T, J, P + 3 + S); see `minimise`."""
-        point = torch.cat((shared.expand(len(states), -1), states), 1)
-        return by_differences(self._residuals, point, len(self.parameters), with_jacobian)
-
-    def _residuals(self, point: Tensor, episode: Tensor) -> Tensor:
-        count, joints = len(self.parameters), self.tracks.values.shape[2]
-        values = torch.where(self.units > 0, self.units * point[:, :count], point[:, :count].exp())
-        column = {p.name: values[:, k] for k, p in enumerate(self.parameters)}
-        state = point[:, count + len(NOTED) :].unflatten(1, (-1, joints))
-        first = [
-            middle[episode] + std[episode] * state[:, k]
-            for k, (middle, std) in enumerate(zip(self.start[:2], self.start[2:], strict=True))
-        ]
+    def forces(self, values: Tensor, common: Tensor, states: Tensor, episode: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the unknown forces of the parts, and what is not known of the sensor; see `JointLosses`."""
         # in proportion to the masses, so that a factor of these leaves what unknown forces move where it is
-        force = self.part_std[episode] * state[:, 2:] * values[:, count - 1, None, None]
-        more = force.gather(1, self.part[episode][..., None].expand(-1, -1, joints))
-        late = torch.tensor([self.late_s, 1.0, 1.0]).to(point)
-        noted = late * point[:, count : count + len(NOTED)]
-        moved = self.driven.motion(column, episode, first, more, noted)
-        found = (self.root[episode] @ (moved - self.tracks.values[episode])[..., None])[..., 0]
-        return found.nan_to_num(nan=1e6, posinf=1e6, neginf=-1e6)
+        force = self.part_std[episode] * states * values[:, -1, None, None]
+        more = force.gather(1, self.part[episode][..., None].expand(-1, -1, force.shape[2]))
+        return more, torch.tensor([self.late_s, 1.0, 1.0]).to(common) * common
 
     @property
     def size(self) -> int:

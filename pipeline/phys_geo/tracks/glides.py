@@ -28,7 +28,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
-from torch import Tensor
 
 from ....datasets.capture.tracks import Episode
 from ....schemas.materials import of_pair
@@ -48,7 +47,7 @@ from .joint_losses import (
     MOST_FRAMES,
     ROBUST_SCALE,
     TOLERANCE,
-    by_differences,
+    JointLosses,
     information_root,
     starts,
     takes,
@@ -168,20 +167,8 @@ def moves_on(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Parts:
-    """Parts (E) with T frames of J joints, as a least-squares problem."""
-
-    driven: ForceDriven
-    tracks: JointTracks
-    parameters: Sequence[Parameter]
-    """Losses, and the factor of inertia, if there is one (P)."""
-    root: Tensor
-    """Symmetric root of the information of the tracks, shape (E, T, J, J)."""
-    start: tuple[Tensor, Tensor, Tensor, Tensor]
-    """First guess of values and speeds, and the standard deviations of their priors, each (E, J)."""
-    units: Tensor
-    """Units in which losses, in which the motion is linear, are coordinates; 0 for a factor, whose logarithm is one,
-    shape (P,)."""
+class _Parts(JointLosses):
+    """Parts (E) of episodes in which nothing pushes; fitted are losses, and the factor of inertia, if there is one."""
 
     @staticmethod
     def of(world: World, parameters: Sequence[Parameter], parts: Sequence[Part], noise: Noise) -> _Parts:
@@ -200,23 +187,6 @@ class _Parts:
             start=(middle, speed, OPEN * std[0], OPEN * std[1]),
             units=torch.tensor([p.prior[0] if p.name.endswith(LOSSES) else 0.0 for p in parameters]).double(),
         )
-
-    def residuals(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
-        """Return residuals (E, T, J) in sigmas and their derivatives (E, T, J, P + 2 J); see `minimise`."""
-        point = torch.cat((shared.expand(len(states), -1), states), 1)
-        return by_differences(self._residuals, point, len(self.parameters), with_jacobian)
-
-    def _residuals(self, point: Tensor, part: Tensor) -> Tensor:
-        count, joints = len(self.parameters), self.tracks.values.shape[2]
-        values = torch.where(self.units > 0, self.units * point[:, :count], point[:, :count].exp())
-        column = {p.name: values[:, k] for k, p in enumerate(self.parameters)}
-        state = point[:, count:].unflatten(1, (2, joints))
-        middle, std = self.start[:2], self.start[2:]
-        first = [middle[k][part] + std[k][part] * state[:, k] for k in range(2)]
-        none = point.new_zeros(len(point), self.tracks.values.shape[1] - 1, joints)
-        moved = self.driven.motion(column, part, first, none, point.new_zeros(len(point), 3))
-        found = (self.root[part] @ (moved - self.tracks.values[part])[..., None])[..., 0]
-        return found.nan_to_num(nan=1e6, posinf=1e6, neginf=-1e6)
 
 
 def _fitted(data: _Parts) -> tuple[NDArray[np.float64], NDArray[Any], dict[str, Any]]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from ...physics.parameters import Parameter
 from ...physics.world import World
+from .force_driven import ForceDriven
 from .joint_tracks import JointTracks
 
 MOST_FRAMES = 400
@@ -24,6 +28,58 @@ ITERATIONS, TOLERANCE = 80, 1e-5
 """Limit on steps of a descent, and the share of the cost below which a step ends it."""
 FLAT = 0.1
 """Information of the prior of a loss in a descent, in its unit, as a root: draws have the real one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointLosses:
+    """Losses in joints as a least-squares problem: episodes, or parts of these (E), with T frames of J joints.
+
+    A point has coordinates of the parameters, of what else is common to all episodes, and of the states of each.
+    """
+
+    driven: ForceDriven
+    """The motion of the links under the forces that act."""
+    tracks: JointTracks
+    """What the tracks tell of the joints."""
+    parameters: Sequence[Parameter]
+    """What is fitted (P)."""
+    root: Tensor
+    """Symmetric root of the information of the tracks, shape (E, T, J, J)."""
+    start: tuple[Tensor, Tensor, Tensor, Tensor]
+    """First guess of values and speeds, and the standard deviations of their priors, each (E, J)."""
+    units: Tensor
+    """Units in which losses, in which the motion is linear, are coordinates; 0 for a factor, whose logarithm is one,
+    shape (P,)."""
+    common: ClassVar[int] = 0
+    """Number of coordinates that are no parameters and common to all episodes."""
+
+    def forces(self, values: Tensor, common: Tensor, states: Tensor, episode: Tensor) -> tuple[Tensor, Tensor]:
+        """Return further generalised forces (N, T - 1, J), and what is unknown of a sensor (N, 3): none here.
+
+        Args:
+            values: Values of the parameters (N, P).
+            common: Coordinates that are common to all episodes (N, C).
+            states: Coordinates of the states behind those of values and speeds at the start (N, ..., J).
+            episode: The episodes (N,).
+        """
+        return values.new_zeros(len(values), *self.tracks.values[0, 1:].shape), values.new_zeros(len(values), 3)
+
+    def residuals(self, shared: Tensor, states: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor | None]:
+        """Return residuals (E, T, J) in sigmas and their derivatives by all coordinates of a point; see `minimise`."""
+        point = torch.cat((shared.expand(len(states), -1), states), 1)
+        return by_differences(self._residuals, point, len(self.parameters), with_jacobian)
+
+    def _residuals(self, point: Tensor, episode: Tensor) -> Tensor:
+        count, joints = len(self.parameters), self.tracks.values.shape[2]
+        own, common, states = point.tensor_split((count, count + self.common), 1)
+        values, states = torch.where(self.units > 0, self.units * own, own.exp()), states.unflatten(1, (-1, joints))
+        middle, std = self.start[:2], self.start[2:]
+        first = [middle[k][episode] + std[k][episode] * states[:, k] for k in range(2)]
+        more, noted = self.forces(values, common, states[:, 2:], episode)
+        column = {p.name: values[:, k] for k, p in enumerate(self.parameters)}
+        moved = self.driven.motion(column, episode, first, more, noted)
+        found = (self.root[episode] @ (moved - self.tracks.values[episode])[..., None])[..., 0]
+        return found.nan_to_num(nan=1e6, posinf=1e6, neginf=-1e6)
 
 
 def takes(world: World) -> bool:
