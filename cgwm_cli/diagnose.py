@@ -223,6 +223,18 @@ def _experiment(found: NextExperiment) -> list[str]:
 
 
 def _row(entry: RankedEffect, result: DiagnoseResult) -> list[str]:
+    return [
+        entry.effect,
+        ", ".join(entry.acts_in),
+        entry.judged_in,
+        f"{entry.score_p:.2g}" if entry.score_p > 0 else "< 1e-300",
+        _evidence(entry, result),
+        _numbers(entry),
+    ]
+
+
+def _numbers(entry: RankedEffect) -> str:
+    """Return the parameters of an effect, and by how much they differ between groups or episodes."""
     numbers = ", ".join(
         f"{p.name} = {p.estimate:.3g} +- {p.std_error:.2g}{'' if p.unit == '1' else f' {p.unit}'}"
         for p in entry.parameters[:3]
@@ -234,14 +246,7 @@ def _row(entry: RankedEffect, result: DiagnoseResult) -> list[str]:
         stds = ", ".join(f"{std:.2g}" for std in entry.spread.values())
         differ = "differs" if len(entry.spread) == 1 else "differ"
         numbers += f"; {', '.join(entry.spread)} {differ} by {stds} from {unit} to {unit}"
-    return [
-        entry.effect,
-        ", ".join(entry.acts_in),
-        entry.judged_in,
-        f"{entry.score_p:.2g}" if entry.score_p > 0 else "< 1e-300",
-        _evidence(entry, result),
-        numbers,
-    ]
+    return numbers
 
 
 def _evidence(entry: RankedEffect, result: DiagnoseResult) -> str:

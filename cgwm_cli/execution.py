@@ -195,14 +195,19 @@ def _unforeseen(error: BaseException, debug: bool) -> str:
     if ran_out_of_memory(error):
         return "Out of memory.\nNext: close other programs, or work on less at a time."
     if isinstance(error, ModuleNotFoundError):
-        if (error.name or "").partition(".")[0] == "cgwm":
-            return (
-                f"This installation of cgwm lacks '{error.name}', as it does after new files came into a checkout.\n"
-                "Next: run 'make install' in the checkout, or install cgwm again."
-            )
-        return f"The package '{error.name}' is not installed.\nNext: run 'cgwm doctor', which prints the pip line."
+        return _without_module(error.name or "")
     hint = "" if debug else "\nNext: run the command again with --debug, and report the traceback."
     return f"Internal error in cgwm: {type(error).__name__}: {error}{hint}"
+
+
+def _without_module(name: str) -> str:
+    """Return the message about a module that is not there."""
+    if name.partition(".")[0] == "cgwm":
+        return (
+            f"This installation of cgwm lacks '{name}', as it does after new files came into a checkout.\n"
+            "Next: run 'make install' in the checkout, or install cgwm again."
+        )
+    return f"The package '{name}' is not installed.\nNext: run 'cgwm doctor', which prints the pip line."
 
 
 def _say_interrupted(state: str = "") -> int:

@@ -9,7 +9,7 @@ from typing import Any
 
 def explain(error: Any, arguments: list[str]) -> str:
     """Format a usage error of typer as our messages: what was found, what is allowed, what to do next."""
-    from ..schemas import UsageError, did_you_mean
+    from ..schemas import UsageError
 
     context = getattr(error, "ctx", None)
     command = context.command_path if context else "cgwm"
@@ -18,22 +18,26 @@ def explain(error: Any, arguments: list[str]) -> str:
         return error.format_message()
     option = getattr(error, "option_name", None)
     if option is not None and type(error).__name__ == "NoSuchOption":
-        legal = _options(context)
-        found = f"{command}: there is no option '{option}'."
-        return str(UsageError(found, f"{', '.join(legal)}.{did_you_mean(option, legal)}", todo))
-    verbs = list(getattr(context.command, "commands", {})) if context else []
+        return _none_called(command, "option", option, _options(context))
     message = _sentence(error.format_message().replace("Value error, ", ""))
     if message.startswith("No such command"):
         before = len(command.split()) - 1  # words of the group that should have the verb
         verb = next((word for word in arguments[before:] if not word.startswith("-")), "")
-        found = f"{command}: there is no command '{verb}'."
-        return str(UsageError(found, f"{', '.join(verbs)}.{did_you_mean(verb, verbs)}", todo))
+        return _none_called(command, "command", verb, list(getattr(context.command, "commands", {})) if context else [])
     parameter = getattr(error, "param", None)
     if context and type(error).__name__ == "MissingParameter" and getattr(parameter, "nargs", 1) == -1:
         # of "MODEL... CAPTURE" a single path is taken for the last, although the first was meant
         needed = " and ".join(_arguments(context))
         return str(UsageError(f"{command}: {needed} are needed; one of them is missing.", todo=todo))
     return str(UsageError(f"{command}: {message}{_nearest_choice(message)}", todo=todo))
+
+
+def _none_called(command: str, kind: str, name: str, legal: list[str]) -> str:
+    """Return the message about an option or a command that does not exist."""
+    from ..schemas import UsageError, did_you_mean
+
+    found, allowed = f"{command}: there is no {kind} '{name}'.", f"{', '.join(legal)}.{did_you_mean(name, legal)}"
+    return str(UsageError(found, allowed, f"run '{command} --help'."))
 
 
 def _arguments(context: Any) -> list[str]:

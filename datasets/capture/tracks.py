@@ -196,10 +196,18 @@ def _check_header(path: Path, header: list[str]) -> None:
     twice = first_repeated(header)
     if twice is not None:
         raise InputDataError(f"{path}, line 1: the column '{twice}' stands twice.", todo="remove one.")
+    lacking = _lacking(header)
+    if lacking is not None:
+        raise InputDataError(f"{path}, line 1: no column '{lacking}'.", f"{allowed}.", todo)
+
+
+def _lacking(header: list[str]) -> str | None:
+    """Return the first column that is required and not there, or of which others of its group are; None without one."""
     for group in (_REQUIRED, *_OPTIONAL_GROUPS.values()):
         lacking = [column for column in group if column not in header]
         if lacking and (group is _REQUIRED or len(lacking) < len(group)):
-            raise InputDataError(f"{path}, line 1: no column '{lacking[0]}'.", f"{allowed}.", todo)
+            return lacking[0]
+    return None
 
 
 def _track(path: Path, body: str, header: list[str], rows: list[tuple[int, list[str]]]) -> tuple[Track, int]:

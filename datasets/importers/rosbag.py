@@ -141,15 +141,18 @@ def _read(path: Path, topic: str | None) -> tuple[list[list[float]], str, str]:
 
 def _chosen(path: Path, reader: Any, topic: str | None) -> tuple[str, str]:
     """Return the topic, and the child frame where it holds transforms."""
-    kinds = {connection.topic: connection.msgtype for connection in reader.connections}
-    poses = sorted(name for name, kind in kinds.items() if kind in POSES)
+    poses, transforms = _topics(reader, tuple(POSES)), _topics(reader, (TRANSFORMS,))
     name, _, frame = (topic or "").partition(":")
     if topic is None and len(poses) == 1:
         name = poses[0]
-    if name in poses or (frame and kinds.get(name) == TRANSFORMS):
+    if name in poses or (frame and name in transforms):
         return name, frame
-    transforms = [f"{name}:CHILD_FRAME" for name, kind in kinds.items() if kind == TRANSFORMS]
-    raise _no_such_topic(path, topic, len(poses), [*poses, *sorted(transforms)])
+    raise _no_such_topic(path, topic, len(poses), [*poses, *(f"{one}:CHILD_FRAME" for one in transforms)])
+
+
+def _topics(reader: Any, kinds: Sequence[str]) -> list[str]:
+    """Return the topics with messages of some types."""
+    return sorted({connection.topic for connection in reader.connections if connection.msgtype in kinds})
 
 
 def _no_such_topic(path: Path, topic: str | None, poses: int, legal: Sequence[str]) -> InputDataError:

@@ -56,14 +56,18 @@ def simulate(mechanics: Mechanics, hidden: Sequence[Hidden], start: Start, lengt
             moment = reader.moment(step * STEP_S, data.qpos[:3], data.qpos[3:], data.qvel[:3], data.qvel[3:], pressed)
             for touch in touches:
                 _change_contact(model, mechanics, touch, moment)
-            if pushes:
-                data.xfrc_applied[1] = np.sum([np.concatenate(push(moment)) for push in pushes], axis=0)
+            data.xfrc_applied[1] = _sum_of(pushes, moment)
         mujoco.mj_step(model, data)
         if friction:
             friction.update(data)
     if not np.isfinite(poses).all():
         raise ArithmeticError("MuJoCo's motion is not finite")
     return Motion(np.arange(count, dtype=np.float64) * STEP_S, poses[:, :3], poses[:, 3:], touching)
+
+
+def _sum_of(pushes: Sequence[Callable[[Moment], tuple[Array, Array]]], moment: Moment) -> Array:
+    """Return the force and the torque (6,) of effects together."""
+    return np.sum([np.zeros(6), *(np.concatenate(push(moment)) for push in pushes)], axis=0)
 
 
 def _change_contact(
