@@ -21,8 +21,10 @@ from changes import Mutant, applied, sample
 from line_map import PACKAGES, environment_of, mirror_of
 from spread import fork_pytest, kill_group, preload
 
-TEST_START_S, PATIENCE = 45.0, 4.0
-"""A run may take so long [s], and so many times what its tests took when they were mapped."""
+TEST_START_S, PATIENCE = 120.0, 5.0
+"""A run may take so long [s], and so many times what its tests took when they were mapped: kernels whose source a
+mutant changes are compiled anew.
+"""
 
 FRESH = ("new", "not run by a test")
 """States of mutants that no test has run."""
