@@ -33,6 +33,10 @@ from .view_overlap import require_body_in_masks
 from .views import COVERED, View, body_windows
 from .visual_hull import carve
 
+SEEN_DEPTH = 0.7
+"""How far below the surface spheres that are only seen lie at first, in collision radii: pictures show a surface where
+they become opaque, which is less far out than they collide."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class BodyResult:
@@ -62,23 +66,22 @@ def fit_body(stage: Stage, index: int, body: Body) -> tuple[BodyResult, Spheres 
     T_world_body = _pose_matrix(body.photo_pose or Pose())
     note(f"{body.name}: shape from {len(masked)} photos")
     solid = _solid(stage, index, body, masked, T_world_body)
-    world = None if solid is None else _fit_spheres(stage, index, body, solid)
+    felt = _felt(stage, index, body, solid)
+    world = None if felt is None else _fit_spheres(stage, index, body, felt)
     if body.photo_pose is None and body.shape is None and world is not None:
         T_world_body = np.eye(4)
         T_world_body[:3, 3] = world.means.double().mean(0).cpu().numpy()
     T_body_world = np.linalg.inv(T_world_body)
     note(f"{body.name}: colliding spheres")
-    felt = _felt(stage, index, body, solid)
     collision, distance, mass_properties = _contact_properties(stage, body, felt, T_body_world)
     visual = None
-    if world is not None and solid is not None:
+    if world is not None and felt is not None:
         visual = world.moved(_tensor(T_body_world, stage.device)).to_numpy()
-        outside = solid if felt is None else felt  # flat faces have the normals of their planes
-        nearest = KDTree(outside.surface).query(world.means.cpu().numpy())[1]
-        visual = replace(visual, normals=outside.normals[nearest] @ T_body_world[:3, :3].T)
+        nearest = KDTree(felt.surface).query(world.means.cpu().numpy())[1]  # flat faces have those of their planes
+        visual = replace(visual, normals=felt.normals[nearest] @ T_body_world[:3, :3].T)
         if stage.config.collision == "visual":
             collision = visual
-            distance = float(_union(visual, stage.config).distance(_moved(solid, T_body_world).surface).max())
+            distance = float(_union(visual, stage.config).distance(_moved(felt, T_body_world).surface).max())
         _record_collision(stage, body.name, collision, visual, distance)
     pose = body.photo_pose or _pose(T_world_body)
     return BodyResult(
@@ -139,13 +142,13 @@ def _hull(stage: Stage, index: int, body: Body) -> Volume:
 
 
 def _felt(stage: Stage, index: int, body: Body, solid: Volume | None) -> Volume | None:
-    """Return what collides of a solid from photos: with flat faces where the photos show them."""
+    """Return a solid from photos with flat faces where the photos show them."""
     if solid is None or body.shape is not None or not stage.config.flat_faces:
         return solid
     note(f"{body.name}: flat faces")
     views = [view for view in stage.train if view.labels is not None]
     felt, faces = flatten_faces(solid, views, index, stage.config.seed)
-    stage.record[body.name]["flat_faces"] = asdict(faces)
+    stage.record.setdefault(body.name, {})["flat_faces"] = asdict(faces)
     return felt
 
 
@@ -153,12 +156,16 @@ def _fit_spheres(stage: Stage, index: int, body: Body, solid: Volume) -> Spheres
     """Fit the visual spheres of a body: geometry and colours together, or geometry first (the only use of maps)."""
     config, device = stage.config, stage.device
     started = time.perf_counter()
-    centers, scales, surface_count = body_seeds(solid, config.max_body_spheres, config.radius_factor, config.seed)
-    spheres = to_spheres(centers, scales, 0.95, device)
     windows = body_windows(stage.train, index)
     geometry = Rates(means=0.05, log_scales=0.02, logits=0.03)
     maps = any(one is not None for view in windows for one in (view.depth, view.normals, view.features))
     joint = not maps if config.joint is None else config.joint
+    # maps of depth are compared with the surface that collides
+    depth = SEEN_DEPTH if joint and config.collision != "visual" else 1.0
+    centers, scales, surface_count = body_seeds(
+        solid, config.max_body_spheres, config.radius_factor, config.seed, depth
+    )
+    spheres = to_spheres(centers, scales, 0.95, device)
     record: dict[str, Any] = {"spheres": len(spheres), "surface_spheres": surface_count, "joint": joint}
     if not joint:
         spheres, losses = _fit_geometry(stage, index, body, solid, spheres, windows, geometry)

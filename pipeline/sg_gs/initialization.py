@@ -31,7 +31,9 @@ _CELL_SCALE = 0.55
 _THINNEST = 0.35  # of the radius elsewhere: smaller spheres would leave gaps
 
 
-def body_seeds(solid: Volume, max_spheres: int, radius_factor: float, seed: int) -> tuple[Array, Array, int]:
+def body_seeds(
+    solid: Volume, max_spheres: int, radius_factor: float, seed: int, depth: float = 1.0
+) -> tuple[Array, Array, int]:
     """Return spheres whose union, at the collision radius, fills a solid: a layer inside its surface, and a filling.
 
     Args:
@@ -39,6 +41,7 @@ def body_seeds(solid: Volume, max_spheres: int, radius_factor: float, seed: int)
         max_spheres: Maximum number of spheres.
         radius_factor: Collision radius in units of the scale.
         seed: Seed.
+        depth: How far centres of the layer lie below the surface, in collision radii; below 1 the layer stands out.
 
     Returns:
         Centres [m] in the frame of the solid, shape (n, 3), scales [m], shape (n,), and the number of spheres at the
@@ -59,6 +62,7 @@ def body_seeds(solid: Volume, max_spheres: int, radius_factor: float, seed: int)
     centers[thin] = surface - radii[thin, None] * normals
     inner, inner_radii = _filling(solid, centers, radii, max_spheres - len(index))
     scales = np.concatenate([radii, inner_radii]) / radius_factor
+    centers = centers + (1 - depth) * radii[:, None] * solid.normals[index]
     return np.concatenate([centers, inner]), scales, len(index)
 
 

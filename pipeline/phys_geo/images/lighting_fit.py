@@ -32,6 +32,7 @@ from ...rendering.video_view import usable_cameras, video_view
 from ...runtime.device import resolve_device
 from ...sg_gs.colors import sphere_weights
 from ...sg_gs.views import load_views
+from .edge_colors import even_edges
 
 Array = NDArray[np.float64]
 
@@ -117,7 +118,7 @@ def learn_appearance(
     for index, body in enumerate(model.file.bodies):
         mine = [frame for frame in frames if frame.body == index]
         if mine:
-            splats[body.name] = _colored(model, index, mine, light, seen[body.name], drawn_on)
+            splats[body.name] = even_edges(_colored(model, index, mine, light, seen[body.name], drawn_on))
             # where the visual spheres collide, they stay one set
             if model.collision.get(body.name) is model.body_splats[body.name]:
                 collision[body.name] = splats[body.name]

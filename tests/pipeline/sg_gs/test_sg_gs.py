@@ -10,11 +10,13 @@ import torch
 from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.geometry.directions import fibonacci_directions
+from cgwm.pipeline.geometry.primitives import shape_volume
 from cgwm.pipeline.rendering.render import render
 from cgwm.pipeline.sg_gs import bodies, mcmc
 from cgwm.pipeline.sg_gs.depth_refinement import Refinement, refine
+from cgwm.pipeline.sg_gs.initialization import body_seeds
 from cgwm.pipeline.sg_gs.stage import _open, fit_scene
-from cgwm.schemas import InputDataError, SplatConfig
+from cgwm.schemas import InputDataError, Shape, SphereShape, SplatConfig
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 110.0
 RADIUS, PLACE = 0.05, np.array([0.01, -0.02, 0.05])
@@ -201,6 +203,17 @@ def test_the_body_is_where_it_stood(result):
     # The hull of 9 silhouettes, each pixel 2.6 mm wide, is a polyhedron around the ball.
     assert RADIUS - 2e-3 < reach.max() < RADIUS + 12e-3
     assert len(ball.collision) <= CONFIG.max_collision_spheres
+
+
+def test_a_layer_that_is_only_seen_begins_closer_to_the_surface(tmp_path):
+    """At depth 0.7 its centres lie 0.3 radii further out; radii and filling are the same."""
+    ball = shape_volume(Shape(sphere=SphereShape(radius_m=0.05)), tmp_path)
+    deep, scales, layer = body_seeds(ball, 60, 2.0, 0)
+    seen, same, _ = body_seeds(ball, 60, 2.0, 0, depth=0.7)
+    np.testing.assert_array_equal(same, scales)
+    np.testing.assert_array_equal(seen[layer:], deep[layer:])
+    out = np.linalg.norm(seen, axis=1) - np.linalg.norm(deep, axis=1)
+    np.testing.assert_allclose(out[:layer], 0.3 * 2.0 * scales[:layer], rtol=0.02)
 
 
 def test_a_body_without_photos_has_the_spheres_of_its_shape(tmp_path):
