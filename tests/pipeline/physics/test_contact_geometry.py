@@ -15,7 +15,7 @@ from cgwm.pipeline.physics.checks import overlaps
 from cgwm.pipeline.physics.contact_detection import Placed, _gap_along, all_body_points
 from cgwm.pipeline.physics.edge_contact import Crossings, Edges, best_normal
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
-from cgwm.pipeline.physics.hull import Hull, hull_distance
+from cgwm.pipeline.physics.hull import OVERHANG_M, Hull, _over_flat, hull_distance, parallel_face
 from cgwm.pipeline.physics.impulse_solver import tangent_axes
 from cgwm.pipeline.physics.rollout import require_finite
 from cgwm.pipeline.physics.rollout_cost import rollout_part, rollout_seconds
@@ -191,3 +191,20 @@ def test_depth_is_measured_from_where_the_ground_lies() -> None:
     world = replace(world_of(ball_body(0.04)), ground_offset=batch(0.5))
     (found,) = overlaps(world, state_of(((0, 0, 0.533), UP, (0, 0, 0), (0, 0, 0))))
     assert float(found.depth_m) == pytest.approx(0.007, abs=1e-12)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_foot_lies_on_a_face_up_to_the_overhang_beyond_each_of_its_sides(axis: int) -> None:
+    half = torch.tensor((0.05, 0.04, 0.03), dtype=F64)
+    body = box_body(tuple(half.tolist()))
+    hull = Hull.of(body.centers[0], body.radii[0], plane_contacts(body.centers[0], body.radii[0]))
+    assert hull is not None
+    turned = torch.eye(3, dtype=F64)[axis][None]
+    flat, others = parallel_face(hull, turned), [k for k in range(3) if k != axis]
+    corner = body.centers[0].abs().amax(0)
+    for side, sign in ((side, sign) for side in others for sign in (-1.0, 1.0)):
+        points = torch.zeros(2, 3, dtype=F64)
+        points[:, axis] = half[axis] + 0.01
+        points[:, side] = sign * (corner[side] + OVERHANG_M * torch.tensor([0.9, 1.2], dtype=F64))
+        points[:, next(k for k in others if k != side)] = 0.3 * corner[side]
+        assert _over_flat(points[None], hull, flat).tolist() == [[True, False]]

@@ -20,6 +20,7 @@ from cgwm.pipeline.physics.chains.values import with_chain_values
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.engine import rollout
+from cgwm.pipeline.physics.fused.tree import _link_columns
 from cgwm.schemas import InputDataError, UsageError
 from helpers.chains import chained, double_pendulum, drawer, link, still
 from helpers.worlds import F64, ball_body, batch, times
@@ -608,3 +609,11 @@ def test_the_inertia_of_a_drive_adds_to_the_mass_of_its_joint_alone() -> None:
     )
     torch.testing.assert_close(geared.mass - plain.mass, 0.05 * torch.eye(2, dtype=F64)[None])
     torch.testing.assert_close(geared.bias, plain.bias)
+
+
+def test_kernels_take_the_inertia_of_a_link_with_its_products_in_order() -> None:
+    chain, bodies = double_pendulum()
+    full = batch([[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]])
+    row = _link_columns(chained(chain, *bodies[:2], replace(bodies[2], inertia=full)), chain)[0]
+    mass_inertia_com = row[-10:]
+    torch.testing.assert_close(mass_inertia_com[1:7], batch([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])[0])
