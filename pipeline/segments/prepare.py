@@ -385,11 +385,25 @@ def _model_correlated_noise(state: _State) -> None:
     state.noise_model, correlated = estimate_noise_model(state.observations, state.flight, state.noise)
     if state.noise_model == WHITE:
         return
+    again, clean = _noise_model_of_clean(state)
+    if again != WHITE:
+        state.noise_model, correlated = again, clean
     position, rotation = (max(c or n, g or 0.0) for c, n, g in zip(correlated, state.noise, state.given, strict=True))
     state.noise = Noise(position, rotation)
+    state.observations = _without_edges(state.observations, state.airborne, state.noise_model)
     state.segment(state.touched | _smeared(state.observations, ~state.airborne, state.noise_model))
     state.fit_flights()
     state.warnings.append(noise_model_warnings(state.noise_model))
+
+
+def _noise_model_of_clean(state: _State) -> tuple[NoiseModel, tuple[float | None, float | None]]:
+    """Return the noise model and standard deviations of flights without frames into which a filter smears contacts.
+
+    These frames are off by more than the noise, which counted as noise where the filter was not known yet.
+    """
+    smeared = _smeared(state.observations, ~state.airborne, state.noise_model)
+    flight = cut_episodes(state.world, state.observations, state.noise, state.touched | smeared)[0]
+    return estimate_noise_model(state.observations, flight, state.noise)
 
 
 def _smeared(whole: Observations, contact: Tensor, noise_model: NoiseModel) -> Tensor:
@@ -398,14 +412,39 @@ def _smeared(whole: Observations, contact: Tensor, noise_model: NoiseModel) -> T
     A filter lets no white noise pass: errors of which a part is white were not made by one, however long others last.
     """
     seen = whole.seen.amax(-1) > 0
+    reach = _reach(whole, noise_model)
+    near = torch.nn.functional.max_pool1d((contact & seen).double()[:, None], 2 * reach + 1, 1, reach)
+    return near[:, 0] > 0
+
+
+def _reach(whole: Observations, noise_model: NoiseModel) -> int:
+    """Return how many frames a filter smears a contact over."""
+    seen = whole.seen.amax(-1) > 0
     step_s = float(
         np.median(np.concatenate([_steps(times, known) for times, known in zip(whole.times_s, seen, strict=True)]))
     )
     memory_s = max((noise.time_s for noise in noise_model if noise.share > LIMITS.filtered), default=0.0)
-    reach_s = min(LIMITS.smeared_times * memory_s, max(LIMITS.smeared_s, LIMITS.filter_frames * step_s))
-    reach = max(LIMITS.smeared_frames, math.ceil(reach_s / step_s))
-    near = torch.nn.functional.max_pool1d((contact & seen).double()[:, None], 2 * reach + 1, 1, reach)
-    return near[:, 0] > 0
+    longest_s = LIMITS.low_pass_s if _is_low_pass(noise_model) else LIMITS.smeared_s
+    reach_s = min(LIMITS.smeared_times * memory_s, max(longest_s, LIMITS.filter_frames * step_s))
+    return max(LIMITS.smeared_frames, math.ceil(reach_s / step_s))
+
+
+def _is_low_pass(noise_model: NoiseModel) -> bool:
+    """Return whether a low pass made the errors."""
+    return any(noise.share > LIMITS.filtered and noise.order >= LIMITS.filter_order for noise in noise_model)
+
+
+def _without_edges(whole: Observations, airborne: Tensor, noise_model: NoiseModel) -> Observations:
+    """Return the episodes without the first frames of a record that a low pass bent; see `edge_share`.
+
+    A filter that runs both ways continues a record beyond its ends as it likes, and a body that is let go begins to
+    fall within a frame.
+    """
+    if not _is_low_pass(noise_model):
+        return whole
+    frames, seen = math.ceil(LIMITS.edge_share * _reach(whole, noise_model)), whole.seen.amax(-1) > 0
+    first = {k: int(row.nonzero()[0, 0]) for k, row in enumerate(seen) if bool(row.any())}
+    return without_held(whole, {k: at + frames for k, at in first.items() if bool(airborne[k, at : at + 2].all())})
 
 
 def _steps(times_s: Tensor, known: Tensor) -> NDArray[np.float64]:
