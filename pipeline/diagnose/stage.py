@@ -42,7 +42,7 @@ from ..report.page_file import shows_the_same
 from ..runtime.device import resolve_device
 from ..runtime.resources import one_torch_thread
 from ..runtime.work_budget import motion_doubt, within_budget
-from ..segments.candidates import Candidate, admissible
+from ..segments.candidates import Candidate, admissible, without_effects
 from ..segments.center_of_mass import as_one_body
 from ..segments.described_motion import not_described
 from ..segments.flights.residual_wrench import Omnibus, covariates_of, wrench_windows
@@ -359,7 +359,8 @@ def _law(prepared: Prepared, findings: Findings) -> ResidualLaw | None:
     """
     if prepared.flight is None:
         return None
-    world = findings.base if findings.verdict == "unexplained" else findings.world
+    withheld = [one.effect for one in findings.flight.withheld]
+    world = findings.base if findings.verdict == "unexplained" else without_effects(findings.world, *withheld)
     windows = wrench_windows(world, prepared.observations, prepared.flight.items, prepared.noise, prepared.noise_model)
     if windows is None:
         return None

@@ -68,6 +68,8 @@ class FlightFindings:
     """Share of what repeats from episode to episode that the selected effects explain; 1 where nothing is left."""
     own_law: str | None = None
     """What accelerations that differ from episode to episode follow, so that they are none of each episode's own."""
+    withheld: tuple[OtherForms, ...] = ()
+    """Other forms of forces that `world` has and no step names, since their law is not known."""
 
     @property
     def in_flight(self) -> list[str]:
@@ -82,7 +84,7 @@ class FlightFindings:
     @property
     def remains(self) -> bool:
         """Whether a residual exceeds the noise beside the selected effects."""
-        return is_significant(self.after) or self.recurs
+        return is_significant(self.after) or self.recurs or bool(self.withheld)
 
     @property
     def recurs(self) -> bool:
@@ -300,6 +302,7 @@ class _Search:
             left=left,
             common_share=share,
             own_law=own_law,
+            withheld=tuple(one for one in tested.others if one.effect in tested.withheld),
         )
 
 

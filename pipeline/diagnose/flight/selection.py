@@ -68,6 +68,10 @@ class FlightSelection(NamedTuple):
         gone = names | ({active.effect.name for active in self.world.effects} - left)
         return FlightSelection([step for step in self.steps if step.best.name not in gone], world, flight)
 
+    def unnamed(self, names: frozenset[str]) -> FlightSelection:
+        """Leave out the names of some effects, which stay in the world as forces of a law that is not known."""
+        return self._replace(steps=[step for step in self.steps if step.best.name not in names])
+
     def without_idle(self) -> FlightSelection:
         """Leave out the effects that have no number, or without which held-out flights are predicted as well.
 
@@ -112,6 +116,8 @@ class JudgedSelection:
     """The constant forces that do not act as much late in the flights as early."""
     agreement: Consistency | None = None
     """Whether the effects have the same parameters in all episodes; None without effects."""
+    withheld: frozenset[str] = frozenset()
+    """Effects whose law is another one, and beside which the others were judged: they stay in the world, unnamed."""
 
 
 def _with_numbers(step: SelectionStep, numbers: Mapping[str, Mapping[str, tuple[float, float]]]) -> SelectionStep:
@@ -212,15 +218,31 @@ def judged(
     )
     fleeting = frozenset(without_lasting(found.flight, found.world, found.names, scatter))
     wrong = {one.effect for one in others if one.likelier} | fleeting
+    withheld: frozenset[str] = frozenset()
     if wrong and set(found.names) - wrong and not _is_mostly_other(found, others):
-        left = found.without(wrong)
-        found = left if left.names else found  # a wind is none without the drag through which it acts
+        if _most_evident(found) in wrong or any(_carrying(found, name) for name in wrong):
+            left = found.without(wrong)
+            found = left if left.names else found  # a wind is none without the drag through which it acts
+        else:
+            # what is left of a force without its name would count against the name of another one
+            withheld = frozenset(wrong & set(found.names))
+            found = found.unnamed(withheld)
     found = _without_levelling(prepared, found, scatter)
     agreement = _agreement(prepared, found, found.names, scatter)
     if slow is not None and agreement is not None and (agreement.doubtful or followed):
         found = _without_contradicted(prepared, found, scatter, followed)
         agreement = _agreement(prepared, found, found.names, scatter)
-    return JudgedSelection(selection=found, others=others, fleeting=fleeting, agreement=agreement)
+    if withheld and not found.names:
+        found, withheld = found.without(set(withheld)), frozenset()
+    return JudgedSelection(
+        selection=found, others=others, fleeting=fleeting, agreement=agreement, withheld=withheld
+    )
+
+
+def _most_evident(found: FlightSelection) -> str:
+    """Return the name of the selected effect with the most evidence."""
+    named = [step.best for step in found.steps if step.best.name in found.names]
+    return min(named, key=lambda one: math.inf if one.delta_bic is None else one.delta_bic).name
 
 
 def _is_mostly_other(found: FlightSelection, others: Sequence[OtherForms]) -> bool:
@@ -228,9 +250,8 @@ def _is_mostly_other(found: FlightSelection, others: Sequence[OtherForms]) -> bo
 
     The others are then fitted beside a law that is wrong, and what it leaves may look like any of them.
     """
-    named = [step.best for step in found.steps if step.best.name in found.names]
-    most = min(named, key=lambda one: math.inf if one.delta_bic is None else one.delta_bic)
-    return any(one.effect == most.name and one.odds > LIMITS.other_law for one in others)
+    most = _most_evident(found)
+    return any(one.effect == most and one.odds > LIMITS.other_law for one in others)
 
 
 def _without_levelling(prepared: Prepared, found: FlightSelection, scatter: float) -> FlightSelection:

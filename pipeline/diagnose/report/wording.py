@@ -65,7 +65,7 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         others = [e.candidate.spec for e in one.equals[1:]]
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
     named = listed([word or name for word, name in zip(words, names, strict=True)])
-    return f"{_called(findings)}: {named}.{_apart(findings)}{_as_good(findings)}{_rest(findings, law)}"
+    return f"{_called(findings)}: {named}.{_apart(findings)}{_as_good(findings)}{_withheld(findings)}{_rest(findings, law)}"
 
 
 def _nearest(findings: Findings) -> str:
@@ -78,6 +78,16 @@ def _nearest(findings: Findings) -> str:
             words.append(
                 f" Nearest is {form.effect}, but these flights hardly tell it from {form.words}. Next, {form.then}."
             )
+    return "".join(words)
+
+
+def _withheld(findings: Findings) -> str:
+    """Return which forces act beside the named ones and have no name, as their law is not known; empty for none."""
+    words = [
+        f" Beside it a force acts to which {one.effect} is nearest, but which these flights do not tell from "
+        f"{one.words}. Next, {one.then}."
+        for one in findings.flight.withheld
+    ]
     return "".join(words)
 
 
