@@ -203,6 +203,13 @@ class VerdictThresholds:
         "beside correlated errors, one of several effects is left out if the loss of held-out flights rises by less",
         "by argument, as in `improve`; looked at on one recording of throws, it takes away the second of two drags",
     )
+    needed_chi2: float = threshold(
+        50.0,
+        "chi2",
+        "it is not left out where the loss rises by this much: no error of the noise model is that large in many flights",
+        "by argument: seven standard errors; of 300 real-like captures of development `needed_share` alone took away "
+        "two effects, both true (87 and 88)",
+    )
     zero_errors: float = threshold(
         1.0,
         "standard errors",

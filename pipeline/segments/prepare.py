@@ -435,16 +435,23 @@ def _is_low_pass(noise_model: NoiseModel) -> bool:
 
 
 def _without_edges(whole: Observations, airborne: Tensor, noise_model: NoiseModel) -> Observations:
-    """Return the episodes without the first frames of a record that a low pass bent; see `edge_share`.
+    """Return the episodes without the frames at the ends of a record that a low pass bent; see `edge_share`.
 
     A filter that runs both ways continues a record beyond its ends as it likes, and a body that is let go begins to
     fall within a frame.
     """
     if not _is_low_pass(noise_model):
         return whole
-    frames, seen = math.ceil(LIMITS.edge_share * _reach(whole, noise_model)), whole.seen.amax(-1) > 0
-    first = {k: int(row.nonzero()[0, 0]) for k, row in enumerate(seen) if bool(row.any())}
-    return without_held(whole, {k: at + frames for k, at in first.items() if bool(airborne[k, at : at + 2].all())})
+    frames = math.ceil(LIMITS.edge_share * _reach(whole, noise_model))
+    seen, turned = whole.seen.clone(), whole.has_orientation.clone()
+    for episode, row in enumerate(whole.seen.amax(-1) > 0):
+        known = row.nonzero()[:, 0].tolist()
+        if not known:
+            continue
+        for at, edge in ((known[0], slice(0, known[0] + frames)), (known[-1], slice(known[-1] + 1 - frames, None))):
+            if airborne[episode, at]:
+                seen[episode, edge], turned[episode, edge] = 0.0, 0.0
+    return replace(whole, seen=seen, has_orientation=turned)
 
 
 def _steps(times_s: Tensor, known: Tensor) -> NDArray[np.float64]:

@@ -141,7 +141,7 @@ class PreparationThresholds:
     edge_share: float = threshold(
         0.5,
         "1",
-        "share of it over which a low pass bends the begin of a flight at the begin of a record",
+        "share of it over which a low pass bends a flight at an end of a record",
         "by argument: the acceleration has a step there, not the velocity; 12 Hz bend a fall by 0.3 mm over 0.04 s",
     )
     filter_frames: int = threshold(

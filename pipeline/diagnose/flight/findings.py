@@ -24,6 +24,7 @@ from ...segments.linearization import linearize
 from ...segments.prepare import Prepared
 from ...segments.segments import Segments
 from ..evidence.effect_selection import SelectionStep, repeats
+from ..evidence.evidence import Evidence
 from ..evidence.falsification import Consistency
 from ..thresholds import THRESHOLDS
 from .omnibus import flight_windows, is_significant, worst_omnibus
@@ -70,6 +71,9 @@ class FlightFindings:
     """What accelerations that differ from episode to episode follow, so that they are none of each episode's own."""
     withheld: tuple[OtherForms, ...] = ()
     """Other forms of forces that `world` has and no step names, since their law is not known."""
+
+    levelled: tuple[Evidence, ...] = ()
+    """Tilts that all episodes have, and that are no more than errors of levelling."""
 
     @property
     def in_flight(self) -> list[str]:
@@ -303,6 +307,7 @@ class _Search:
             common_share=share,
             own_law=own_law,
             withheld=tuple(one for one in tested.others if one.effect in tested.withheld),
+            levelled=tested.levelled,
         )
 
 

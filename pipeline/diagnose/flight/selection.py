@@ -16,6 +16,7 @@ from ...segments.segment_fit import refit
 from ...segments.segments import Segments
 from ..evidence.cross_validation import held_out_loss
 from ..evidence.effect_selection import SelectionStep
+from ..evidence.evidence import Evidence
 from ..evidence.falsification import Consistency, consistency, fitted_numbers
 from ..thresholds import THRESHOLDS
 from .coupled_effects import DRAGS
@@ -118,6 +119,8 @@ class JudgedSelection:
     """Whether the effects have the same parameters in all episodes; None without effects."""
     withheld: frozenset[str] = frozenset()
     """Effects whose law is another one, and beside which the others were judged: they stay in the world, unnamed."""
+    levelled: tuple[Evidence, ...] = ()
+    """Tilts that all episodes have, and that are no more than errors of levelling."""
 
 
 def _with_numbers(step: SelectionStep, numbers: Mapping[str, Mapping[str, tuple[float, float]]]) -> SelectionStep:
@@ -227,7 +230,8 @@ def judged(
             # what is left of a force without its name would count against the name of another one
             withheld = frozenset(wrong & set(found.names))
             found = found.unnamed(withheld)
-    found = _without_levelling(prepared, found, scatter)
+    before, found = found, _without_levelling(prepared, found, scatter)
+    levelled = tuple(step.best for step in before.steps if step.best.name in set(before.names) - set(found.names))
     agreement = _agreement(prepared, found, found.names, scatter)
     if slow is not None and agreement is not None and (agreement.doubtful or followed):
         found = _without_contradicted(prepared, found, scatter, followed)
@@ -235,7 +239,12 @@ def judged(
     if withheld and not found.names:
         found, withheld = found.without(set(withheld)), frozenset()
     return JudgedSelection(
-        selection=found, others=others, fleeting=fleeting, agreement=agreement, withheld=withheld
+        selection=found,
+        others=others,
+        fleeting=fleeting,
+        agreement=agreement,
+        withheld=withheld,
+        levelled=levelled,
     )
 
 
@@ -329,7 +338,8 @@ def _unless_needed(found: FlightSelection, name: str) -> FlightSelection:
     other = found.without({name})
     if found.flight is None or other.flight is None:
         return found
-    limit = (1 + LIMITS.needed_share) * held_out_loss(found.flight, found.world)
+    loss = held_out_loss(found.flight, found.world)
+    limit = loss + min(LIMITS.needed_share * loss, LIMITS.needed_chi2)
     return other if held_out_loss(other.flight, other.world) < limit else found
 
 

@@ -51,9 +51,12 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
     """
     names = [c.evidence.candidate.spec for c in findings.chosen]
     if findings.verdict == "none_missing":
-        return f"Nothing is missing that these data could show.{_DIFFERS if findings.remaining else ''}"
+        return (
+            f"Nothing is missing that these data could show.{_DIFFERS if findings.remaining else ''}"
+            f"{_levelled(findings)}"
+        )
     if findings.verdict == "law_inexact":
-        return f"No effect is named, but {_INEXACT}: {_misfit(findings)}{_described(findings)}"
+        return f"No effect is named, but {_INEXACT}: {_misfit(findings)}{_described(findings)}{_levelled(findings)}"
     if findings.verdict == "unexplained":
         if findings.flight.untold:
             return _UNTOLD
@@ -65,7 +68,8 @@ def sentence(findings: Findings, law: ResidualLaw | None) -> str:
         others = [e.candidate.spec for e in one.equals[1:]]
         words.append(f"{one.evidence.candidate.spec} (or {', '.join(others)}: not separable)" if others else "")
     named = listed([word or name for word, name in zip(words, names, strict=True)])
-    return f"{_called(findings)}: {named}.{_apart(findings)}{_as_good(findings)}{_withheld(findings)}{_rest(findings, law)}"
+    beside = f"{_withheld(findings)}{_rest(findings, law)}{_levelled(findings)}"
+    return f"{_called(findings)}: {named}.{_apart(findings)}{_as_good(findings)}{beside}"
 
 
 def _nearest(findings: Findings) -> str:
@@ -79,6 +83,18 @@ def _nearest(findings: Findings) -> str:
                 f" Nearest is {form.effect}, but these flights hardly tell it from {form.words}. Next, {form.then}."
             )
     return "".join(words)
+
+
+def _levelled(findings: Findings) -> str:
+    """Return which tilt of all flights is no more than errors of levelling, and how to add it; empty for none."""
+    for one in findings.flight.levelled:
+        sizes = [value for name, (value, _) in one.estimates.items() if name.startswith("tilt")]
+        if sizes:
+            return (
+                f" All flights share a tilt of {1e3 * math.hypot(*sizes):.2g} mrad, which is no more than frames and "
+                f"grounds are off level by: it is not named; `--effects {one.candidate.spec}` adds it."
+            )
+    return ""
 
 
 def _withheld(findings: Findings) -> str:
