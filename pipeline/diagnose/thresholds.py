@@ -206,7 +206,7 @@ class VerdictThresholds:
     needed_chi2: float = threshold(
         50.0,
         "chi2",
-        "it is not left out where the loss rises by this much: no error of the noise model is that large in many flights",
+        "it is not left out where the loss rises by this much: no error of the noise model is as large in many flights",
         "by argument: seven standard errors; of 300 real-like captures of development `needed_share` alone took away "
         "two effects, both true (87 and 88)",
     )
