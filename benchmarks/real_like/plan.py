@@ -31,6 +31,7 @@ Stage = Literal[
     "report13",
     "report14",
     "report15",
+    "report16",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on `development` alone. Each report stage is read once, after everything is fixed: the first
