@@ -19,6 +19,7 @@ from ..trajectories.flight_noise import flight_noise, slow_noise, without_outlie
 from ..trajectories.innovations import WHITE, NoiseModel
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, supported_frames, whole_episodes
+from ..trajectories.smoothing_filter import SmoothingFilter, smoothing_filter
 from ..trajectories.time_errors import time_errors, time_shifts
 from ..trajectories.track_noise import Noise, noise_of
 from .carried_starts import carried_starts
@@ -381,68 +382,78 @@ def _time_warnings(state: _State) -> list[str]:
 
 
 def _model_correlated_noise(state: _State) -> None:
-    """Estimate how errors are correlated in time; where they are, cut and fit again with that noise model."""
+    """Estimate how errors are correlated in time; where they are, cut and fit again with that noise model.
+
+    What a filter bends beside contacts is no noise, so that the noise is estimated again without it.
+    """
     state.noise_model, correlated = estimate_noise_model(state.observations, state.flight, state.noise)
     if state.noise_model == WHITE:
         return
-    again, clean = _noise_model_of_clean(state)
-    if again != WHITE:
-        state.noise_model, correlated = again, clean
+    reach = _reach(state.observations, state.noise_model)
+    if _is_filtered(state.noise_model):
+        smoothed = _filter_of(state, reach)
+        if smoothed is not None:
+            reach = max(LIMITS.smeared_frames, smoothed.reach)
+            if smoothed.low_pass:
+                edge = math.ceil(LIMITS.edge_share * reach)
+                state.observations = _without_edges(state.observations, state.airborne, edge)
+        again, clean = estimate_noise_model(state.observations, _flights_beyond(state, reach), state.noise)
+        if again != WHITE:
+            state.noise_model, correlated = again, clean
     position, rotation = (max(c or n, g or 0.0) for c, n, g in zip(correlated, state.noise, state.given, strict=True))
     state.noise = Noise(position, rotation)
-    state.observations = _without_edges(state.observations, state.airborne, state.noise_model)
-    state.segment(state.touched | _smeared(state.observations, ~state.airborne, state.noise_model))
+    state.segment(state.touched | _smeared(state.observations, ~state.airborne, reach))
     state.fit_flights()
     state.warnings.append(noise_model_warnings(state.noise_model))
 
 
-def _noise_model_of_clean(state: _State) -> tuple[NoiseModel, tuple[float | None, float | None]]:
-    """Return the noise model and standard deviations of flights without frames into which a filter smears contacts.
+def _filter_of(state: _State, reach: int) -> SmoothingFilter | None:
+    """Return the filter that smoothed positions, from flights without frames within a reach of contacts."""
+    flight = _flights_beyond(state, reach)
+    without, (std_m, _) = estimate_noise_model(state.observations, flight, state.noise)
+    if std_m is None:
+        return None
+    return smoothing_filter(state.observations, flight, std_m, without.position)
 
-    These frames are off by more than the noise, which counted as noise where the filter was not known yet.
-    """
-    smeared = _smeared(state.observations, ~state.airborne, state.noise_model)
-    flight = cut_episodes(state.world, state.observations, state.noise, state.touched | smeared)[0]
-    return estimate_noise_model(state.observations, flight, state.noise)
+
+def _is_filtered(noise_model: NoiseModel) -> bool:
+    """Return whether a filter made the errors of positions: they are differentiable, and have no white part."""
+    return noise_model.position.share > LIMITS.filtered and noise_model.position.order > 1
 
 
-def _smeared(whole: Observations, contact: Tensor, noise_model: NoiseModel) -> Tensor:
-    """Return the frames (E, T) into which a filter smears contacts: it reaches as far as it correlates errors.
+def _flights_beyond(state: _State, reach: int) -> list[Segment]:
+    """Return the flights without frames within a reach of contacts."""
+    touched = state.touched | _smeared(state.observations, ~state.airborne, reach)
+    return cut_episodes(state.world, state.observations, state.noise, touched)[0]
 
-    A filter lets no white noise pass: errors of which a part is white were not made by one, however long others last.
-    """
+
+def _smeared(whole: Observations, contact: Tensor, reach: int) -> Tensor:
+    """Return the frames (E, T) within a number of frames of contacts."""
     seen = whole.seen.amax(-1) > 0
-    reach = _reach(whole, noise_model)
     near = torch.nn.functional.max_pool1d((contact & seen).double()[:, None], 2 * reach + 1, 1, reach)
     return near[:, 0] > 0
 
 
 def _reach(whole: Observations, noise_model: NoiseModel) -> int:
-    """Return how many frames a filter smears a contact over."""
+    """Return how many frames a filter that is not known smears contacts over: as far as it correlates errors.
+
+    A filter lets no white noise pass: errors of which a part is white were not made by one, however long others last.
+    """
     seen = whole.seen.amax(-1) > 0
     step_s = float(
         np.median(np.concatenate([_steps(times, known) for times, known in zip(whole.times_s, seen, strict=True)]))
     )
     memory_s = max((noise.time_s for noise in noise_model if noise.share > LIMITS.filtered), default=0.0)
-    longest_s = LIMITS.low_pass_s if _is_low_pass(noise_model) else LIMITS.smeared_s
-    reach_s = min(LIMITS.smeared_times * memory_s, max(longest_s, LIMITS.filter_frames * step_s))
+    reach_s = min(LIMITS.smeared_times * memory_s, max(LIMITS.smeared_s, LIMITS.filter_frames * step_s))
     return max(LIMITS.smeared_frames, math.ceil(reach_s / step_s))
 
 
-def _is_low_pass(noise_model: NoiseModel) -> bool:
-    """Return whether a low pass made the errors."""
-    return any(noise.share > LIMITS.filtered and noise.order >= LIMITS.filter_order for noise in noise_model)
-
-
-def _without_edges(whole: Observations, airborne: Tensor, noise_model: NoiseModel) -> Observations:
-    """Return the episodes without the frames at the ends of a record that a low pass bent; see `edge_share`.
+def _without_edges(whole: Observations, airborne: Tensor, frames: int) -> Observations:
+    """Return the episodes without the frames at the ends of a record that a low pass bent, where they are of flight.
 
     A filter that runs both ways continues a record beyond its ends as it likes, and a body that is let go begins to
     fall within a frame.
     """
-    if not _is_low_pass(noise_model):
-        return whole
-    frames = math.ceil(LIMITS.edge_share * _reach(whole, noise_model))
     seen, turned = whole.seen.clone(), whole.has_orientation.clone()
     for episode, row in enumerate(whole.seen.amax(-1) > 0):
         known = row.nonzero()[:, 0].tolist()

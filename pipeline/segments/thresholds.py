@@ -125,19 +125,6 @@ class PreparationThresholds:
         "by argument: a filter smears a contact as far as it correlates errors",
     )
     smeared_s: float = threshold(0.04, "s", "longest such time: slower errors come from no filter", BY_ARGUMENT)
-    filter_order: float = threshold(
-        2.5,
-        "order",
-        "of the process that errors follow, from which a low pass made them: only a filter makes errors twice "
-        "differentiable",
-        "by argument: a low pass of second order run both ways falls as the fourth power of the frequency",
-    )
-    low_pass_s: float = threshold(
-        0.1,
-        "s",
-        "the longest such time where a low pass made the errors",
-        "by argument: a low pass of 12 Hz smears a bounce of 5 m/s by 0.3 mm after 0.08 s, one of 20 Hz after 0.05 s",
-    )
     edge_share: float = threshold(
         0.5,
         "1",

@@ -137,6 +137,23 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int, std: f
     return _Found(noise._replace(size=size / likeliest), likeliest, most)
 
 
+def windows_of(whole: Observations, flight: Sequence[Segment], kind: int, std: float) -> list[_Windows]:
+    """Return windows of flights, those of equal frame times as one, without such as are wrong.
+
+    Args:
+        whole: The episodes (E).
+        flight: Their flight segments.
+        kind: 0 for positions, 1 for rotations.
+        std: Standard deviation of the tracks, beside errors of the frames' times.
+    """
+    windows = _windows(whole, flight, kind, std)
+    if not windows:
+        return []
+    sizes = np.concatenate([w.variances for w in windows])
+    kept = [w.without(LIMITS.wrong * float(np.median(sizes))) for w in windows]
+    return [w.merged() for w in kept if len(w.left)]
+
+
 @dataclass(frozen=True)
 class _Found:
     """The noise of one kind."""

@@ -6,6 +6,7 @@ Those of the tracks' noise and of the cuts between flight and contact stand here
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -151,6 +152,19 @@ class TrackNoiseThresholds:
         "the same of each kind",
         "see `sure_both`",
         "see `sure_both`",
+    )
+    sure_filter: float = threshold(
+        2 * math.log(100),
+        "2 log L",
+        "the same of a filter of the tracks over errors that last without one",
+        "by argument: odds of 100",
+    )
+    cutoff_periods: float = threshold(
+        1.2,
+        "1 / cut-off",
+        "how far a low pass bends a flight before and after a contact",
+        "by argument: a bounce of 5 m/s is off by 0.2 mm there and by 1 mm after 0.8 (12 to 35 Hz); cut-offs are found "
+        "to within a fifth",
     )
     told_by_window: float = threshold(
         0.5,
