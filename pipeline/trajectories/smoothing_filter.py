@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ LASTING = ((0.0, 1.0), (0.01, 0.0), (0.01, 0.05), (0.03, 0.0), (0.03, 0.05))
 """How long errors last before the filter [s], and the share of their variance that is white."""
 ROUNDING = 1e-4
 """Share of the variance that passes no filter: without any, what a low pass leaves could not be inverted."""
-GRID, LAGS = 2048, 400
+GRID, LAGS = 1024, 200
 """Number of frequencies, and the longest lag in frames, of correlations."""
 
 
@@ -84,7 +85,7 @@ def smoothing_filter(
         return -0.5 * (logs + count * math.log(max(square / count, 1e-300)))
 
     def filtered(correlation: Array) -> list[torch.Tensor]:
-        parts = [(1 - ROUNDING) * np.interp(gap / step_s, np.arange(LAGS), correlation) for gap in gaps]
+        parts = [(1 - ROUNDING) * np.interp(gap / step_s, np.arange(LAGS), correlation, right=0.0) for gap in gaps]
         return [torch.from_numpy(part + ROUNDING * np.eye(part.shape[1])) for part in parts]
 
     own = [torch.from_numpy(gap) for gap in gaps]
@@ -120,11 +121,17 @@ def _frequencies() -> Array:
     return (np.arange(GRID) + 0.5) / (2 * GRID)
 
 
+@cache
+def _cosines() -> Array:
+    """Return the cosines (lags, frequencies) that make correlations of spectra."""
+    return np.asarray(np.cos(2 * math.pi * _frequencies() * np.arange(LAGS)[:, None]))
+
+
 def _correlation(gain: Array, lasting_s: float, white: float, step_s: float) -> Array:
     """Return the correlation of errors that passed a filter, over whole numbers of frames."""
     f, before = _frequencies(), np.ones(GRID)
     if lasting_s:
         kept = math.exp(-step_s / lasting_s)
         before = white + (1 - white) * (1 - kept**2) / (1 - 2 * kept * np.cos(2 * math.pi * f) + kept**2)
-    found = np.cos(2 * math.pi * f * np.arange(LAGS)[:, None]) @ (gain * before)
+    found = _cosines() @ (gain * before)
     return np.asarray(found / found[0])
