@@ -63,7 +63,7 @@ def test_the_page_pairs_captures() -> None:
     text = engine_page.page([engine_page.reduced(one) for one in rows])
     assert "| cgwm | 3 | 511.0 / 2.0 | 17.12 | 10 | 3 of 3 | 3 |" in text
     assert "-2.0 (-2.0 to -2.0)" in text and "| fall | 2 | 1.00 | 1.00 | +0.00 |" in text
-    assert "| fall | rapier | 3 | box wood, box wood (seed 501), box wood (seed 502) |" in text
+    assert "| fall | rapier | 3 | 3 | box wood, box wood (seed 501), box wood (seed 502) |" in text
 
 
 def test_a_draft_goes_on_where_it_stopped(tmp_path: Path) -> None:
