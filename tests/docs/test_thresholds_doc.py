@@ -193,6 +193,11 @@ SEGMENT_NUMERICS = {
 TRACK_NUMERICS = {
     "end of a descent, or its grid": (
         "correlated_noise.REMEMBERED",
+        "smoothing_filter.CUTOFFS_HZ",
+        "smoothing_filter.HIGHEST",
+        "smoothing_filter.PARABOLAS",
+        "smoothing_filter.LASTING",
+        "smoothing_filter.ROUNDING",
         "time_errors.TRIED_S",
         "time_errors.FACTORS",
         "time_errors.BINS",
@@ -238,6 +243,7 @@ TRACK_NUMERICS = {
     "bounds the duration or the resolution": (
         "innovations.RESOLUTION_S",
         "innovations.MOST_NUMBERS",
+        "smoothing_filter.GRID, LAGS",
         "state_uncertainty.MAX_ITEMS",
         "observations.START_FRAMES",
         "initial_state.MIN_FRAMES",
