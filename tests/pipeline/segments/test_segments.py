@@ -1,6 +1,8 @@
 """Segments: their degrees of freedom, states of straight lines, and what a linearization weighs."""
 
 import math
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from cgwm.pipeline.physics.parameters import Parameter
 from cgwm.pipeline.segments import segments as segments_module
 from cgwm.pipeline.segments.first_contact_fit import MAX_WINDOWS, _prior, windows_of
 from cgwm.pipeline.segments.held_out_gain import HeldOutGain
+from cgwm.pipeline.segments.prepare import LIMITS as PREPARE_LIMITS
+from cgwm.pipeline.segments.prepare import Prepared
 from cgwm.pipeline.segments.segment_fit import Linear, Refit, robust_excess
 from cgwm.pipeline.segments.segments import Segments, _line
 from cgwm.pipeline.trajectories.observations import Observations
@@ -160,3 +164,19 @@ def test_chunks_hold_each_segment_once_and_as_many_variations_as_are_rolled_at_o
     chunks = many.chunks(4)
     assert [k for chunk in chunks for k in chunk] == list(range(7))
     assert len(chunks) == 3 and all(4 * len(chunk) <= 12 for chunk in chunks)
+
+
+def test_the_least_force_is_that_of_parabolas_through_the_flights() -> None:
+    """The error of the acceleration of a parabola, by least squares, over as many points as are close together."""
+    count, std_m = 400, 2e-3
+    t = np.linspace(0.0, 0.8, count)
+    design = np.stack([np.ones(count), t, 0.5 * t**2], 1)
+    error = std_m * math.sqrt(np.linalg.inv(design.T @ design)[2, 2])
+    one = SimpleNamespace(
+        flight=SimpleNamespace(items=[Segment(0, 0, count - 1)] * 2),
+        observations=SimpleNamespace(times_s=torch.as_tensor(t)[None]),
+        noise=Noise(std_m, 1e-2),
+    )
+    least = cast(Any, Prepared.least_force_m_s2).fget
+    assert least(one) == pytest.approx(PREPARE_LIMITS.sure * error / math.sqrt(2), rel=0.02)
+    assert least(SimpleNamespace(flight=None)) == math.inf
