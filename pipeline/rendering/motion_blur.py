@@ -37,19 +37,19 @@ def poses_at(grid_s: Array, position_m: Array, quat_wxyz: Array, times_s: Array)
 
 
 def exposed_for(
-    duration_s: float, draw: Draw, shown: Image, poses: Callable[[Array], tuple[Array, Array]], times_s: Array
+    duration_s: float | Array, draw: Draw, shown: Image, poses: Callable[[Array], tuple[Array, Array]], times_s: Array
 ) -> NDArray[np.float32]:
     """Return pictures (F, H, W, 3) that are means over an exposure about each time.
 
     Args:
-        duration_s: How long a picture is exposed [s].
+        duration_s: How long a picture is exposed [s], or each of them (F,).
         draw: Draws pictures of bodies at instants.
         shown: The pictures at the instants `times_s`, shape (F, H, W, 3).
         poses: Returns poses at times (F,).
         times_s: Times of the pictures [s], shape (F,).
     """
     pictures = shown.astype(np.float32)
-    if duration_s == 0:
+    if not np.any(duration_s):
         return pictures
     ends = [poses(times_s + point * duration_s) for point in (_POINTS[0], _POINTS[-1])]
     apart = [np.abs(one - other).reshape(len(times_s), -1).max(1) for one, other in zip(*ends, strict=True)]

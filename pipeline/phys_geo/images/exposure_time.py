@@ -193,13 +193,15 @@ def _errors(renderer: LabelRenderer, frame: _Frame, exposure: Exposure, interval
     touched = ~frame.valid
 
     def draw(_: NDArray[np.intp], position_m: Array, quat_wxyz: Array) -> Image:
-        block = next(iter(renderer.blocks(position_m, quat_wxyz)))
-        touched[:] |= block.mask[0] > 0
-        return block.image
+        blocks = list(renderer.blocks(position_m, quat_wxyz))
+        for block in blocks:
+            touched[:] |= (block.mask > 0).any(0)
+        return np.concatenate([block.image for block in blocks])
 
     now = np.array([frame.time_s])
-    shown = draw(np.zeros(1, np.intp), *frame.poses(now))
-    pictures = [exposed_for(part * interval_s, draw, shown, frame.poses, now)[0] for part in DURATIONS]
+    shown = draw(np.zeros(1, np.intp), *frame.poses(now)).repeat(len(DURATIONS), 0)
+    times = now.repeat(len(DURATIONS))
+    pictures = exposed_for(interval_s * np.array(DURATIONS), draw, shown, frame.poses, times)
     near = cv2.dilate(touched.astype(np.uint8), np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)) > 0
     real = frame.image.astype(np.float32) / np.float32(255)
     return np.array([unexplained(expose(picture, exposure), real, near & frame.valid) for picture in pictures])
