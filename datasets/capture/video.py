@@ -248,5 +248,5 @@ def _undecodable(path: Path) -> InputDataError:
     return InputDataError(
         f"{path}: the video does not decode.",
         "mp4, mov or webm, or a directory of frames.",
-        "convert it, for example into frames: ffmpeg -i VIDEO -start_number 0 %06d.png",
+        "copy it from the camera again, or convert it, for example: ffmpeg -i VIDEO -start_number 0 %06d.png",
     )
