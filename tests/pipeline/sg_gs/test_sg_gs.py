@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,11 +12,13 @@ from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.geometry.primitives import shape_volume
+from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.rendering.render import render
 from cgwm.pipeline.sg_gs import bodies, mcmc
 from cgwm.pipeline.sg_gs.depth_refinement import Refinement, refine
 from cgwm.pipeline.sg_gs.initialization import body_seeds
 from cgwm.pipeline.sg_gs.stage import _open, fit_scene
+from cgwm.pipeline.sg_gs.views import body_windows
 from cgwm.schemas import InputDataError, Shape, SphereShape, SplatConfig
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 110.0
@@ -214,6 +217,21 @@ def test_a_layer_that_is_only_seen_begins_closer_to_the_surface(tmp_path):
     np.testing.assert_array_equal(seen[layer:], deep[layer:])
     out = np.linalg.norm(seen, axis=1) - np.linalg.norm(deep, axis=1)
     np.testing.assert_allclose(out[:layer], 0.3 * 2.0 * scales[:layer], rtol=0.02)
+
+
+def test_spheres_too_far_inside_are_moved_out(capture, result, tmp_path):
+    """Photos move spheres that lie 0.3 of their scales further in further out by about as much."""
+    stage = _open(capture, CONFIG, None)
+    windows, ball = body_windows(stage.train, 0), shape_volume(Shape(sphere=SphereShape(radius_m=RADIUS)), tmp_path)
+    ball = replace(ball, surface=ball.surface + PLACE, origin=ball.origin + PLACE)
+    fitted = Spheres.from_numpy(result.bodies["ball"].visual)
+    fitted = replace(fitted, means=fitted.means + torch.as_tensor(result.bodies["ball"].photo_pose.position_m))
+    away = fitted.means - torch.as_tensor(PLACE)
+    inward = fitted.scales[:, None] * (away / away.norm(dim=1, keepdim=True)).float()
+    found = [
+        bodies._outward(stage, 0, replace(fitted, means=fitted.means - k * inward), ball, windows) for k in (0, 0.3)
+    ]
+    assert found[1][1] - found[0][1] == pytest.approx(0.3, abs=0.11)
 
 
 def test_a_body_without_photos_has_the_spheres_of_its_shape(tmp_path):
