@@ -1,5 +1,8 @@
 """Count what makes source hard to read: `python tools/size.py [FOLDER ...]`; each finding is named.
 
+Before them come by folder the number of functions and their mean lines, without docstrings, comments and blank ones,
+and mean complexity; `--root TREE` takes those of another checkout, to compare.
+
 Counted with `ast` over the installed packages: files over 400 lines, functions over 60 lines, functions of cyclomatic
 complexity over 15 (McCabe: 1 + branches, loops, handlers, comprehensions' conditions and boolean operators), and calls
 of a class of this package that pass more than five arguments by position.
@@ -7,6 +10,7 @@ of a class of this package that pass more than five arguments by position.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import sys
 from collections.abc import Iterator
@@ -28,12 +32,37 @@ def complexity(function: ast.AST) -> int:
     return found
 
 
-def findings(paths: list[Path]) -> Iterator[tuple[str, str]]:
+def code_lines(tree: ast.AST, text: str) -> set[int]:
+    """Return the lines of a source that are neither blank nor comment nor text that stands alone."""
+    texts: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            texts |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    lines = enumerate(text.splitlines(), 1)
+    return {number for number, line in lines if line.strip() and not line.strip().startswith("#")} - texts
+
+
+def means(paths: list[Path]) -> str:
+    """Return the number of functions in some files, and their mean lines and complexity, as a text."""
+    sizes = []
+    for path in paths:
+        text = path.read_text(encoding="utf-8")
+        tree = ast.parse(text)
+        own = code_lines(tree, text)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                within = range(node.lineno, (node.end_lineno or node.lineno) + 1)
+                sizes.append((sum(line in own for line in within), complexity(node)))
+    lines, branches = (sum(column) / max(len(sizes), 1) for column in zip(*sizes or [(0, 0)], strict=True))
+    return f"{len(sizes)} functions, of {lines:.3f} lines and complexity {branches:.3f}"
+
+
+def findings(root: Path, paths: list[Path]) -> Iterator[tuple[str, str]]:
     """Yield (kind, place and figure) of everything over a limit."""
     trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in paths}
     classes = {node.name for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
     for path, tree in trees.items():
-        name = path.relative_to(ROOT)
+        name = path.relative_to(root)
         lines = len(path.read_text(encoding="utf-8").splitlines())
         if lines > MOST_LINES:
             yield "files over 400 lines", f"{name}: {lines}"
@@ -52,9 +81,15 @@ def findings(paths: list[Path]) -> Iterator[tuple[str, str]]:
 
 def main() -> int:
     """Print the number of findings of each kind, and every one of them."""
-    folders = sys.argv[1:] or FOLDERS
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="*", default=FOLDERS)
+    parser.add_argument("--root", type=Path, default=ROOT)
+    given = parser.parse_args()
+    files = {folder: sorted((given.root / folder).rglob("*.py")) for folder in given.folders}
+    for folder, paths in files.items():
+        print(f"{folder}: {means(paths)}")
     found: dict[str, list[str]] = {}
-    for kind, text in findings(sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))):
+    for kind, text in findings(given.root, [path for paths in files.values() for path in paths]):
         found.setdefault(kind, []).append(text)
     for kind, texts in found.items():
         print(f"{kind}: {len(texts)}", *texts, sep="\n  ")
