@@ -9,6 +9,7 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics.parameters import Parameter
+from cgwm.pipeline.segments import prepare as prepare_module
 from cgwm.pipeline.segments import segments as segments_module
 from cgwm.pipeline.segments.first_contact_fit import MAX_WINDOWS, _prior, windows_of
 from cgwm.pipeline.segments.held_out_gain import HeldOutGain
@@ -180,3 +181,15 @@ def test_the_least_force_is_that_of_parabolas_through_the_flights() -> None:
     least = cast(Any, Prepared.least_force_m_s2).fget
     assert least(one) == pytest.approx(PREPARE_LIMITS.sure * error / math.sqrt(2), rel=0.02)
     assert least(SimpleNamespace(flight=None)) == math.inf
+
+
+def test_frames_that_something_supports_are_cut_anew_before_the_noise_is_measured(monkeypatch) -> None:
+    mask, steps = torch.tensor([[False, True, True]]), []
+    state = SimpleNamespace(
+        world=world_of(ball_body()), observations=None, flight=["flight"], noise=None, supported=~mask, warnings=[],
+        segment=steps.append, measure_noise=lambda flight, _: steps.append(flight),
+    )  # fmt: skip
+    monkeypatch.setattr(prepare_module, "supported_frames", lambda *given: mask)
+    prepare_module._mark_supported_frames(state)  # pyright: ignore[reportArgumentType]
+    assert steps == [mask, ["flight"]] and state.supported is mask
+    assert state.warnings[0].startswith("2 frames look airborne")
