@@ -163,10 +163,14 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
                 bottom, top = wilson(right, len(inside))
                 label = f"{who}" if low == BINS[1][0] else None
                 axes.plot([middle, middle], [bottom, top], color=f"C{place}")
+                axes.annotate(f"{right} of {len(inside)}", (1.05 * middle, right / len(inside)), color=f"C{place}")
                 axes.plot(middle, right / len(inside), "o", color=f"C{place}", label=label)
     axes.set(
         xscale="log", ylim=(0, 1), xlabel="largest displacement by the effect / slow error", ylabel="named rightly"
     )
+    places = [edge for low, high in BINS[1:] for edge in (low, min(high, 100.0))]
+    axes.set_xticks(sorted(set(places)), [f"{place:g}" for place in sorted(set(places))])
+    axes.minorticks_off()
     axes.legend()
     figure.tight_layout()
     figure.savefig(path, dpi=120)
