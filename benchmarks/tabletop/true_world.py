@@ -124,12 +124,19 @@ def pose_errors(world: World, plan: ScenePlan, episode: EpisodePlan) -> tuple[fl
     Raises:
         ArithmeticError: If the prediction is not finite.
     """
-    motion = episode.motion
     times = np.arange(episode.frame_count) / plan.frame_rate
-    truth = motion.qpos[motion.rows(times)]
-    place, turn = _predicted(world, episode, times)
+    return pose_errors_at(*_predicted(world, episode, times), episode, times)
+
+
+def pose_errors_at(place: Array, turn: Array, episode: EpisodePlan, times_s: Array) -> tuple[float, float]:
+    """Return the mean error of predicted places (T, 3) [mm] and orientations (T, 4) [deg] at times (T,) [s].
+
+    Raises:
+        ArithmeticError: If the prediction is not finite.
+    """
     if not (np.isfinite(place).all() and np.isfinite(turn).all()):
         raise ArithmeticError(f"the prediction of episode {episode.name} diverges")
+    truth = episode.motion.qpos[episode.motion.rows(times_s)]
     shift = np.linalg.norm(place - truth[:, :3], axis=1)[1:].mean()
     angle = 2 * np.arccos(np.abs((turn * truth[:, 3:7]).sum(1)).clip(0, 1))[1:].mean()
     return 1e3 * float(shift), float(np.degrees(angle))
