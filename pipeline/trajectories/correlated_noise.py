@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -137,7 +137,7 @@ def _likeliest(whole: Observations, flight: Sequence[Segment], kind: int, std: f
     return _Found(noise._replace(size=size / likeliest), likeliest, most)
 
 
-def windows_of(whole: Observations, flight: Sequence[Segment], kind: int, std: float) -> list[_Windows]:
+def windows_of(whole: Observations, flight: Sequence[Segment], kind: int, std: float) -> list[Windows]:
     """Return windows of flights, those of equal frame times as one, without such as are wrong.
 
     Args:
@@ -167,7 +167,7 @@ class _Found:
 
 
 @dataclass(frozen=True, eq=False)
-class _Windows:
+class Windows:
     """Windows (W) of n frames each, less the polynomials of d coefficients that fit them best."""
 
     times_s: Array
@@ -188,6 +188,11 @@ class _Windows:
         return np.concatenate((self.basis, self.left), 2)
 
     @property
+    def gaps_s(self) -> Array:
+        """Times between frames, shape (W, n, n) [s]."""
+        return np.abs(self.times_s[:, :, None] - self.times_s[:, None])
+
+    @property
     def dof(self) -> Array:
         """Degrees of freedom of each window (W,)."""
         return (self.left.shape[1] - self.basis.shape[2]) * self.columns
@@ -202,13 +207,13 @@ class _Windows:
         """Variance of each window (W,)."""
         return np.asarray((self.left**2).sum((1, 2)) / self.dof)
 
-    def without(self, above: float) -> _Windows:
+    def without(self, above: float) -> Windows:
         """Return the windows whose variance is at most a limit."""
         kept = self.variances <= above
         timed = None if self.timed is None else self.timed[kept]
-        return _Windows(self.times_s[kept], self.basis[kept], self.left[kept], self.columns[kept], timed)
+        return Windows(self.times_s[kept], self.basis[kept], self.left[kept], self.columns[kept], timed)
 
-    def merged(self) -> _Windows:
+    def merged(self) -> Windows:
         """Return the windows with those of equal frame times as one: their covariance is decomposed once.
 
         Beside errors of times each column has a covariance of its own, and becomes a window.
@@ -217,16 +222,16 @@ class _Windows:
             every = self.left.shape[2]
             left, timed = (part.swapaxes(1, 2).reshape(-1, part.shape[1], 1) for part in (self.left, self.timed))
             times, basis = (part.repeat(every, 0) for part in (self.times_s, self.basis))
-            return _Windows(times, basis, left, np.ones(len(left)), timed)
+            return Windows(times, basis, left, np.ones(len(left)), timed)
         grids = np.rint((self.times_s - self.times_s[:, :1]) / RESOLUTION_S)
         _, first, place = np.unique(grids, axis=0, return_index=True, return_inverse=True)
         groups = [self.left[place == k].swapaxes(0, 1).reshape(self.left.shape[1], -1) for k in range(len(first))]
         columns = np.array([group.shape[1] for group in groups])
         padded = [np.pad(group, ((0, 0), (0, columns.max() - group.shape[1]))) for group in groups]
-        return _Windows(self.times_s[first], self.basis[first], np.stack(padded), columns)
+        return Windows(self.times_s[first], self.basis[first], np.stack(padded), columns)
 
 
-def _likelihoods(windows: Sequence[_Windows], noises: Sequence[CorrelatedNoise]) -> list[tuple[float, float]]:
+def _likelihoods(windows: Sequence[Windows], noises: Sequence[CorrelatedNoise]) -> list[tuple[float, float]]:
     """Return the largest restricted log-likelihood of each of some noise models, and its standard deviation."""
     largest = max(w.times_s.shape[1] * (w.times_s.shape[1] + w.both.shape[2]) * len(w.both) for w in windows)
     some = max(1, MOST_NUMBERS // largest)
@@ -234,37 +239,52 @@ def _likelihoods(windows: Sequence[_Windows], noises: Sequence[CorrelatedNoise])
     return [one for chunk in chunks for one in _likelihoods_together(windows, chunk)]
 
 
-def _likelihoods_together(windows: Sequence[_Windows], noises: Sequence[CorrelatedNoise]) -> list[tuple[float, float]]:
-    """Return what `_likelihoods` does, in one batch.
-
-    Of the residuals of polynomials B of a covariance C: of the dof of all their contrasts, whose covariance has the
-    determinant |C| |B' C^-1 B| (Harville 1974).
-    """
-    square, logs = np.zeros(len(noises)), np.zeros(len(noises))
+def _likelihoods_together(windows: Sequence[Windows], noises: Sequence[CorrelatedNoise]) -> list[tuple[float, float]]:
+    """Return what `_likelihoods` does, in one batch."""
     laws = list(dict.fromkeys((noise.time_s, noise.order) for noise in noises))
     which = [laws.index((noise.time_s, noise.order)) for noise in noises]
     share = torch.tensor([noise.share for noise in noises], dtype=torch.float64)[:, None, None, None]
-    for w in windows:
-        gap = torch.from_numpy(np.abs(w.times_s[:, :, None] - w.times_s[:, None]))
+
+    def covariance(w: Windows) -> Tensor:
+        gap = torch.from_numpy(w.gaps_s)
         alike = torch.stack([matern(gap, *law) for law in laws])[which]
-        covariance = share * alike + (1 - share) * torch.eye(gap.shape[1], dtype=torch.float64)
-        if w.timed is not None:
-            covariance = covariance + torch.diag_embed(torch.from_numpy(w.timed[:, :, 0]))
-        factor = torch.linalg.cholesky(covariance)
+        found = share * alike + (1 - share) * torch.eye(gap.shape[1], dtype=torch.float64)
+        return found if w.timed is None else found + torch.diag_embed(torch.from_numpy(w.timed[:, :, 0]))
+
+    return restricted_likelihoods(windows, covariance)
+
+
+def restricted_likelihoods(
+    windows: Sequence[Windows], covariance: Callable[[Windows], Tensor]
+) -> list[tuple[float, float]]:
+    """Return the largest restricted log-likelihoods of some laws of errors, and their standard deviations.
+
+    Of the residuals of polynomials B of a covariance C: of the dof of all their contrasts, whose covariance has the
+    determinant |C| |B' C^-1 B| (Harville 1974). That of a matrix that is no covariance is minus infinity.
+
+    Args:
+        windows: The windows.
+        covariance: Returns the correlations of windows (W) of n frames under each law, shape (N, W, n, n).
+    """
+    square, logs = 0.0, 0.0
+    for w in windows:
+        correlation = covariance(w)
+        factor = torch.linalg.cholesky_ex(correlation).L
         whitened = torch.linalg.solve_triangular(factor, torch.from_numpy(w.both), upper=False)
         basis, left = whitened.tensor_split([w.basis.shape[2]], 3)
-        inner = torch.linalg.cholesky(basis.mT @ basis)
+        inner = torch.linalg.cholesky_ex(basis.mT @ basis).L
         along = torch.linalg.solve_triangular(inner, basis.mT @ left, upper=False)
-        square += (left.square().sum((1, 2, 3)) - along.square().sum((1, 2, 3))).numpy()
+        square = square + (left.square().sum((1, 2, 3)) - along.square().sum((1, 2, 3))).numpy()
         roots = [one.diagonal(dim1=2, dim2=3).log().sum(2) for one in (factor, inner)]
-        logs += 2 * ((roots[0] + roots[1]) @ torch.from_numpy(w.columns).to(gap)).numpy()
+        logs = logs + 2 * ((roots[0] + roots[1]) @ torch.from_numpy(w.columns).to(correlation)).numpy()
     count = sum(w.count for w in windows)
-    variance = np.maximum(square / max(count, 1), 0.0)
+    variance = np.maximum(np.asarray(square) / max(count, 1), 0.0)
     likelihood = -0.5 * (logs + count * np.log(np.maximum(variance, 1e-300)))
+    likelihood = np.where(np.isnan(likelihood), -np.inf, likelihood)
     return list(zip(likelihood.tolist(), np.sqrt(variance).tolist(), strict=True))
 
 
-def _windows(whole: Observations, flight: Sequence[Segment], kind: int, std: float) -> list[_Windows]:
+def _windows(whole: Observations, flight: Sequence[Segment], kind: int, std: float) -> list[Windows]:
     """Return the windows of all flights, grouped by length and degree; `std`: standard deviation of the tracks."""
     mask = (whole.seen, whole.has_orientation)[kind]
     found: dict[tuple[int, int, int], list[tuple[Array, ...]]] = {}
@@ -294,7 +314,7 @@ def _windows(whole: Observations, flight: Sequence[Segment], kind: int, std: flo
                 left = values - basis @ (basis.T @ values)
                 found.setdefault((length, degree, values.shape[1]), []).append((t, basis, left, *timed))
     stacked = [[np.stack(parts) for parts in zip(*some, strict=True)] for some in found.values()]
-    return [_Windows(t, basis, left, np.full(len(t), left.shape[2]), *timed) for t, basis, left, *timed in stacked]
+    return [Windows(t, basis, left, np.full(len(t), left.shape[2]), *timed) for t, basis, left, *timed in stacked]
 
 
 def _window(whole: Observations, episode: int, column: int, frames: Tensor, kind: int) -> tuple[int, int]:

@@ -10,7 +10,6 @@ by far than errors that last without one.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -19,8 +18,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from .correlated_noise import windows_of
+from .correlated_noise import Windows, restricted_likelihoods, windows_of
 from .innovations import CorrelatedNoise, matern
 from .observations import Observations
 from .segmentation import Segment
@@ -67,39 +67,26 @@ def smoothing_filter(
     if sum(w.count for w in windows) < LIMITS.enough:
         return None
     step_s = float(np.median([np.median(np.diff(w.times_s, axis=1)) for w in windows]))
-    gaps = [np.abs(w.times_s[:, :, None] - w.times_s[:, None]) for w in windows]
-    whitened = [torch.from_numpy(w.both) for w in windows]
 
-    def likelihood(covariances: Sequence[torch.Tensor]) -> float:
-        logs, square, count = 0.0, 0.0, sum(w.count for w in windows)
-        for w, both, covariance in zip(windows, whitened, covariances, strict=True):
-            factor, failed = torch.linalg.cholesky_ex(covariance)
-            if bool(failed.any()):
-                return -math.inf
-            basis, left = torch.linalg.solve_triangular(factor, both, upper=False).tensor_split([w.basis.shape[2]], 2)
-            inner = torch.linalg.cholesky(basis.mT @ basis)
-            along = torch.linalg.solve_triangular(inner, basis.mT @ left, upper=False)
-            square += float(left.square().sum() - along.square().sum())
-            roots = [one.diagonal(dim1=1, dim2=2).log().sum(1) for one in (factor, inner)]
-            logs += 2 * float((roots[0] + roots[1]) @ torch.from_numpy(w.columns).to(covariance))
-        return -0.5 * (logs + count * math.log(max(square / count, 1e-300)))
+    def plain(w: Windows) -> Tensor:
+        gap = torch.from_numpy(w.gaps_s)
+        alike = matern(gap, without.time_s, without.order)
+        return (without.share * alike + (1 - without.share) * torch.eye(gap.shape[1], dtype=torch.float64))[None]
 
-    def filtered(correlation: Array) -> list[torch.Tensor]:
-        parts = [(1 - ROUNDING) * np.interp(gap / step_s, np.arange(LAGS), correlation, right=0.0) for gap in gaps]
-        return [torch.from_numpy(part + ROUNDING * np.eye(part.shape[1])) for part in parts]
+    found, most = None, restricted_likelihoods(windows, plain)[0][0] + LIMITS.sure_filter / 2
+    for one, gain in _filters(step_s):
+        correlations = [_correlation(gain, *lasting, step_s) for lasting in LASTING]
+        likelihood = max(restricted_likelihoods(windows, lambda w, c=correlations: _covariances(w, c, step_s)))[0]
+        if likelihood > most:
+            found, most = one, likelihood
+    return found
 
-    own = [torch.from_numpy(gap) for gap in gaps]
-    plain = [
-        without.share * matern(gap, without.time_s, without.order)
-        + (1 - without.share) * torch.eye(gap.shape[1], dtype=torch.float64)
-        for gap in own
-    ]
-    tried = [
-        (likelihood(filtered(_correlation(gain, *lasting, step_s))), found)
-        for (found, gain), lasting in itertools.product(_filters(step_s), LASTING)
-    ]
-    most, best = max(tried, key=lambda one: one[0])
-    return best if 2 * (most - likelihood(plain)) > LIMITS.sure_filter else None
+
+def _covariances(windows: Windows, correlations: Sequence[Array], step_s: float) -> Tensor:
+    """Return the correlations of windows from those over whole numbers of frames, shape (N, W, n, n)."""
+    gap, lags = windows.gaps_s / step_s, np.arange(LAGS)
+    found = np.stack([np.interp(gap, lags, one, right=0.0) for one in correlations])
+    return torch.from_numpy((1 - ROUNDING) * found + ROUNDING * np.eye(gap.shape[1]))
 
 
 def _filters(step_s: float) -> Iterator[tuple[SmoothingFilter, Array]]:
