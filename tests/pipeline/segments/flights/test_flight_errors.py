@@ -9,7 +9,7 @@ import torch
 from cgwm.pipeline.segments.flights.contrasts import FlightContrasts, _spanned, _spread_frames
 from cgwm.pipeline.segments.flights.restricted_likelihood import Components, RestrictedLikelihood
 from cgwm.pipeline.segments.flights.variance_components import _climbed
-from cgwm.pipeline.trajectories.correlated_noise import _likelihoods, _Windows
+from cgwm.pipeline.trajectories.correlated_noise import Windows, _likelihoods
 from cgwm.pipeline.trajectories.innovations import FALLS, CorrelatedNoise, matern
 from scipy.signal import butter, filtfilt
 
@@ -105,7 +105,7 @@ def test_the_likelihood_of_windows_is_that_of_their_contrasts() -> None:
         covariance = rest.T @ (0.7 * alike + 0.3 * np.eye(14)) @ rest
         square = float(np.einsum("ia,ij,ja->", rest.T @ values, np.linalg.inv(covariance), rest.T @ values))
         known = -0.5 * (3 * np.linalg.slogdet(covariance)[1] + 27 * np.log(square / 27))
-        window = _Windows(t[None], basis[None], left[None], np.array([3]))
+        window = Windows(t[None], basis[None], left[None], np.array([3]))
         other, (found, std) = _likelihoods(
             [window], [CorrelatedNoise(0.5, 0.01), CorrelatedNoise(0.7, 0.03, order=order)]
         )
@@ -118,7 +118,7 @@ def test_windows_of_equal_times_are_decomposed_once_and_tell_the_same() -> None:
     t = np.stack([0.01 * np.arange(12), 3 + 0.01 * np.arange(12), np.sort(rng.uniform(0, 0.1, 12))])
     basis = np.stack([np.linalg.qr(np.vander((row - row[0]) / 0.1, 4))[0] for row in t])
     values = rng.standard_normal((3, 12, 2))
-    windows = _Windows(t, basis, values - basis @ (basis.swapaxes(1, 2) @ values), np.full(3, 2))
+    windows = Windows(t, basis, values - basis @ (basis.swapaxes(1, 2) @ values), np.full(3, 2))
     merged = windows.merged()
     assert sorted(merged.columns.tolist()) == [2, 4] and merged.count == windows.count
     noises = [CorrelatedNoise(0.9, 0.02, order=order) for order in FALLS]
