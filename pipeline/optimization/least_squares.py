@@ -221,7 +221,7 @@ def _trials(descent: Descent, policy: Policy, rows: Rows) -> _Trials:
             step = step * (policy.longest / step.abs().amax(1, keepdim=True)).clamp_max(1.0)
         for share in policy.shares:
             values = box.clamped(here.values + share * step)
-            change = reduced.following((values - here.values)[rows.owner], share)
+            change = _finite_steps(reduced.following((values - here.values)[rows.owner], share))
             change, size = _limited(change, problem, policy, rows)
             points.append(Point(values=values, states=problem.moved(here, values, change, rows)))
             dampings.append(damping)
@@ -245,7 +245,12 @@ def _step(problem: Problem, reduced: Reduced, values: Tensor, box: Box, damping:
     system = damped(matrix, damping, floor=problem.least_information) * moving[:, :, None] * moving[
         :, None
     ] + torch.diag_embed(1 - moving)
-    return solved(system, (slope * moving)[..., None])[..., 0]
+    return _finite_steps(solved(system, (slope * moving)[..., None])[..., 0])
+
+
+def _finite_steps(step: Tensor) -> Tensor:
+    """Return steps (n, S), those that are not finite as none: of equations that no damping makes regular."""
+    return torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
 
 
 def _limited(change: Tensor, problem: Problem, policy: Policy, rows: Rows) -> tuple[Tensor, Tensor]:

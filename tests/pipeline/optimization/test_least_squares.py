@@ -215,6 +215,26 @@ def test_a_group_that_diverges_ends_no_other() -> None:
     assert end.point.values[0].tolist() == pytest.approx([2.0, 0.5, 0.1], abs=1e-6)
 
 
+class Guarded(Curves):
+    """Curves that refuse to be evaluated where a parameter is not finite, as a simulation does."""
+
+    def rows(self, point: Point, rows: Rows) -> Tensor:
+        assert bool(point.values.isfinite().all())
+        return super().rows(point, rows)
+
+
+def test_nothing_is_evaluated_at_a_step_that_is_not_finite() -> None:
+    """Squares of slopes of 1e200 overflow, and no damping makes the equations regular."""
+
+    def steep(x: Tensor) -> Tensor:
+        return (x[:1] + x[1:]) * torch.where(x[:1] < 1, tensor(1e200), 1.0)
+
+    measured = tensor([[0.0], [9.0]])
+    end = run(Guarded(steep, measured, Box.unbounded(measured.expand(2, 2))), [[1e-300, 0.0], [3.0, 2.0]])
+    assert end.point.values[0].tolist() == [1e-300, 0.0]
+    assert float(end.point.values[1].sum()) == pytest.approx(9.0)
+
+
 class Anchored(Problem):
     """States that measure themselves, one in each group."""
 

@@ -12,6 +12,7 @@ from cgwm.pipeline.physics import simulate
 from cgwm.pipeline.physics.contact_detection import slot_count
 from cgwm.pipeline.physics.contact_law import Touch
 from cgwm.pipeline.physics.hull import _thickness
+from cgwm.pipeline.physics.model_world import _with_only_law
 from cgwm.pipeline.physics.paper_law import PaperLaw, clamped, creep_speed, paper_impulses, rest_penetration
 from cgwm.pipeline.physics.patch import LEAST_CARRIED, _carried
 from cgwm.pipeline.physics.surfaces.thin_walls import _after_fall, _half_thickness, _way_through, walls
@@ -65,11 +66,11 @@ def test_a_law_belongs_to_two_materials_in_either_order() -> None:
     assert world.law_of(0, -1) is world.contact and world.pair_between("ice", "ice") is None
     assert world.pair_between(None, "wood") is world.pair_between("wood", None) is None
     assert world.laws == (world.contact, ice, wood)
-    assert world._with_only_law() is world  # several laws are used
-    alone = replace(world, bodies=bodies[:1], ground_material="wood", surfaces=())._with_only_law()
+    assert _with_only_law(world) is world  # several laws are used
+    alone = _with_only_law(replace(world, bodies=bodies[:1], ground_material="wood", surfaces=()))
     assert alone.contact is ice and alone.pair_laws == {}
     plain = replace(world, bodies=bodies[2:], surfaces=())
-    assert plain._with_only_law() is plain
+    assert _with_only_law(plain) is plain
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.5])
