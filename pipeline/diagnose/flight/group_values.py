@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...optimization.tails import chi2_tail, student_tail
-from ...physics.effects.effect import ActiveEffect
-from ...physics.effects.registry import load_effect
+from ...optimization.tails import student_tail
 from ...physics.parameters import Parameter, effect_parameters
 from ...physics.world import World
 from ...segments.candidates import Candidate, Variant, admissible, base_parameters, variants_of, without_effects
@@ -28,8 +26,9 @@ from ...segments.segment_states import fit_states
 from ...segments.segments import Segments
 from ..evidence.effect_selection import SelectionStep
 from ..evidence.evidence import Evidence, prior_odds
-from ..evidence.score_test import ScoreTest, canonical_correlation, solved
+from ..evidence.score_test import canonical_correlation, solved
 from ..thresholds import THRESHOLDS
+from .specific_values import parameters_of, specific_evidence, with_neutral, with_specific
 
 LIMITS = THRESHOLDS.flight
 
@@ -323,8 +322,8 @@ def _refitted(
     candidate: Candidate, world: World, flight: Segments, groups: NDArray[np.int64], start: dict[int, Array]
 ) -> tuple[dict[int, Array], Array, float]:
     """Return an effect's parameters by group, the chi2 of each flight (B,), and that of all with one value for all."""
-    added = _added(candidate, world)
-    own = _own_parameters(candidate, added)
+    added = with_neutral(world, candidate.effect)
+    own = parameters_of(added, candidate.effect.name)
     values, cost = {}, np.zeros(len(groups))
     mean = np.mean(list(start.values()), axis=0)
     alone = refit([flight], added, own, _encoded(own, mean, flight))
@@ -337,17 +336,6 @@ def _refitted(
     return values, cost, alone.cost
 
 
-def _added(candidate: Candidate, world: World) -> World:
-    """Return a world with an effect at neutral."""
-    active = ActiveEffect.of(candidate.effect, {}, world.gravity[0, :1])
-    return replace(world, effects=(*world.effects, active))
-
-
-def _own_parameters(candidate: Candidate, world: World) -> list[Parameter]:
-    """Return the parameters of an effect in a world."""
-    return [p for p in effect_parameters(world) if p.name.partition(".")[0] == candidate.effect.name]
-
-
 def _encoded(parameters: Sequence[Parameter], values: Array, flight: Segments) -> Tensor:
     """Return values within the bounds of their parameters."""
     kept = [float(np.clip(value, *p.bounds)) for p, value in zip(parameters, values, strict=True)]
@@ -356,43 +344,17 @@ def _encoded(parameters: Sequence[Parameter], values: Array, flight: Segments) -
 
 def _placed(prepared: Prepared, best: _Fitted, groups: NDArray[np.int64]) -> tuple[World, Segments]:
     """Return the world with the values of the groups, its other effects fitted again, and the flights in it."""
-    effect = load_effect(f"{best.candidate.spec}@group")
-    names = [p.name for p in best.candidate.effect.parameters]
-    mean = dict(zip(names, best.mean.tolist(), strict=True))
-    active = ActiveEffect.of(effect, mean, best.world.gravity[0, :1])
     own = {
-        episode: {f"{effect.name}.{name}": float(v) for name, v in zip(names, best.values[group], strict=True)}
+        episode: best.values[group]
         for episode, group in zip(prepared.names, prepared.groups, strict=True)
         if group in best.values
     }
-    known = {name: {**best.world.own_values.get(name, {}), **values} for name, values in own.items()}
-    world = replace(best.world, effects=(*best.world.effects, active), own_values=known)
-    flight = replace(best.flight, observations=best.flight.observations.with_own(world)).in_world(world)
+    world, flight = with_specific(best.world, best.flight, f"{best.candidate.spec}@group", best.mean, own)
     found = refit([flight], world, base_parameters(world, "flight"))
     return found.world, found.segments[0]
 
 
 def _evidence(one: _Fitted, gain: float, count: float) -> Evidence:
     """Return the evidence of an effect with a value in each group."""
-    size, groups = len(one.mean), len(one.values)
-    names = [p.name for p in one.candidate.effect.parameters]
-    error = one.spread / math.sqrt(groups)
-    statistic = gain + count * size * groups
-    test = ScoreTest(
-        statistic=statistic,
-        dof=size * groups,
-        p_value=chi2_tail(statistic, size * groups),
-        estimate=one.mean,
-        covariance=np.diag(error**2),
-        admissible=True,
-    )
-    spec = f"{one.candidate.spec}@group"
-    return Evidence(
-        candidate=Candidate(spec, load_effect(spec)),
-        constants={},
-        test=test,
-        p_value=test.p_value,
-        delta_bic=-gain,
-        numbers={name: (float(v), float(e)) for name, v, e in zip(names, one.mean, error, strict=True)},
-        spread=dict(zip(names, one.spread.tolist(), strict=True)),
-    )
+    values = np.array(list(one.values.values()))
+    return specific_evidence(f"{one.candidate.spec}@group", values, gain + count * values.size, -gain)

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...optimization.tails import chi2_tail, student_tail
+from ...optimization.tails import student_tail
 from ...physics.effects.effect import ActiveEffect
 from ...physics.effects.registry import load_effect
-from ...physics.parameters import Parameter, effect_parameters
+from ...physics.parameters import Parameter
 from ...physics.world import World
 from ...segments.candidates import Candidate, base_parameters, without_effects
 from ...segments.prepare import Prepared, whole_flights
@@ -31,9 +31,8 @@ from ...segments.segments import Segments
 from ...trajectories.innovations import WHITE
 from ..evidence.cross_validation import ITERATIONS, KNOWN_SHARE, continued
 from ..evidence.effect_selection import SelectionStep
-from ..evidence.evidence import Evidence
-from ..evidence.score_test import ScoreTest
 from ..thresholds import THRESHOLDS
+from .specific_values import parameters_of, specific_evidence, with_neutral, with_specific
 
 LIMITS = THRESHOLDS.verdict
 
@@ -63,11 +62,17 @@ def with_own_spins(
     whole = fit_states(replace(whole, noise_model=WHITE, observations=replace(whole.observations, time_shift=None)))
     if not predicts(whole, bare):
         return steps, world, flight
-    found = _own(whole, SPIN_LIFT)
-    if follows_heading(whole, found.values):
+    lifts, gain = _by_flights(whole, SPIN_LIFT)
+    if follows_heading(whole, lifts):
         return steps, world, flight
+    spec, every = f"{SPIN_LIFT}@episode", np.array(list(lifts.values()))
+    evidence = specific_evidence(spec, every, gain, -gain)
+    step = SelectionStep((evidence,), (evidence,), True, own_std=float(np.sqrt(np.mean(every.var(0, ddof=1)))))
+    named = {prepared.names[episode]: lift for episode, lift in lifts.items()}
+    lifted, moved = with_specific(bare, flight, spec, every.mean(0), named)
+    fitted = refit([fit_states(moved)], lifted, base_parameters(lifted, "flight"))
     kept = [step for step in steps if step.flagged and step.best.name not in mistaken]
-    return [*kept, _step(found)], *_placed(prepared, found, bare, flight)
+    return [*kept, step], fitted.world, fitted.segments[0]
 
 
 def _untold(prepared: Prepared, world: World, flight: Segments, candidates: Sequence[Candidate]) -> bool:
@@ -85,18 +90,6 @@ def _has_own(active: ActiveEffect) -> bool:
 def _acts_along(candidate: Candidate) -> bool:
     """Return whether an effect is a drag, which no lift can be taken for."""
     return "drag" in candidate.effect.provides
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Own:
-    """An effect with a value for each episode."""
-
-    values: dict[int, Array]
-    """Its parameters (k,) by episode."""
-    error: Array
-    """Their standard errors (k,), root mean square over episodes."""
-    gain: float
-    """Fall of chi2."""
 
 
 def predicts(whole: Segments, world: World) -> bool:
@@ -158,25 +151,13 @@ def _by_episode(away: Tensor, episode: NDArray[np.int64]) -> Array:
     return np.array([float(away[torch.as_tensor(episode == one)].mean()) for one in np.unique(episode)])
 
 
-def _with(world: World, name: str) -> World:
-    """Return a world with an effect at neutral; itself for an empty name."""
-    if not name:
-        return world
-    return replace(world, effects=(*world.effects, ActiveEffect.of(load_effect(name), {}, world.gravity[0, :1])))
-
-
-def _parameters(world: World, name: str) -> list[Parameter]:
-    """Return the parameters of an effect in a world."""
-    return [p for p in effect_parameters(world) if p.name.partition(".")[0] == name]
-
-
 def _second_halves(whole: Segments, name: str) -> Tensor:
     """Return the root mean square error [m] of each second half (B,), from a state and a force fitted to the first."""
     seen = whole.observations
     known = torch.tensor([max(3, round(KNOWN_SHARE * n)) for n in whole.lengths])
     early = (torch.arange(seen.times_s.shape[1]) < known[:, None])[..., None].to(seen.seen)
     first = replace(whole, observations=replace(seen, seen=seen.seen * early))
-    parameters = _parameters(whole.world, name)
+    parameters = parameters_of(whole.world, name)
     values = _estimated(first, parameters)[0] if parameters else seen.times_s.new_zeros(len(known), 0)
     fitted, late = continued(whole, parameters, values)
     away = (fitted.positions(parameters, values) - seen.position_m).square().sum(-1)
@@ -199,64 +180,23 @@ def _estimated(segments: Segments, parameters: Sequence[Parameter]) -> tuple[Ten
     return values, information, segments
 
 
-def _own(whole: Segments, name: str) -> _Own:
-    """Return the likeliest value of an effect in each episode, by its flights."""
+def _by_flights(whole: Segments, name: str) -> tuple[dict[int, Array], float]:
+    """Return the likeliest parameters (k,) of an effect in each episode, by its flights, and the fall of chi2."""
     inside = whole.in_world(_with(whole.world, name))
-    parameters = _parameters(inside.world, name)
+    parameters = parameters_of(inside.world, name)
     before = inside.residuals([], inside.world.gravity.new_zeros(0), jacobian=False)[0].square().sum((1, 2))
     values, information, fitted = _estimated(inside, parameters)
     after = fitted.residuals(parameters, values, jacobian=False)[0].square().sum((1, 2))
     episode = np.array([item.episode for item in whole.items])
     decoded = torch.stack([p.decode(values[:, k]) for k, p in enumerate(parameters)], 1)
-    found, error = {}, []
+    found = {}
     for one in np.unique(episode).tolist():
         mine = torch.as_tensor(episode == one)
-        weight = information[mine].sum(0)
-        mean = torch.linalg.solve(weight, (information[mine] @ decoded[mine, :, None]).sum(0))[:, 0]
-        found[one] = mean.numpy()
-        error.append(torch.linalg.inv(weight).diagonal().numpy())
-    return _Own(values=found, error=np.sqrt(np.mean(error, 0)), gain=float((before - after).sum()))
+        weighted = (information[mine] @ decoded[mine, :, None]).sum(0)
+        found[one] = torch.linalg.solve(information[mine].sum(0), weighted)[:, 0].numpy()
+    return found, float((before - after).sum())
 
 
-def _step(found: _Own) -> SelectionStep:
-    """Return the step that selects a lift of each episode's own."""
-    spec = f"{SPIN_LIFT}@episode"
-    effect = load_effect(spec)
-    names = [parameter.name for parameter in effect.parameters]
-    every = np.array(list(found.values.values()))
-    mean, spread = every.mean(0), every.std(0, ddof=1)
-    error, size = spread / math.sqrt(len(every)), every.size
-    test = ScoreTest(
-        statistic=found.gain,
-        dof=size,
-        p_value=chi2_tail(found.gain, size),
-        estimate=mean,
-        covariance=np.diag(error**2),
-        admissible=True,
-    )
-    evidence = Evidence(
-        candidate=Candidate(spec, effect),
-        constants={},
-        test=test,
-        p_value=test.p_value,
-        delta_bic=-found.gain,
-        numbers={name: (float(v), float(e)) for name, v, e in zip(names, mean, error, strict=True)},
-        spread=dict(zip(names, spread.tolist(), strict=True)),
-    )
-    return SelectionStep((evidence,), (evidence,), True, own_std=float(np.sqrt(np.mean(spread**2))))
-
-
-def _placed(prepared: Prepared, found: _Own, bare: World, flight: Segments) -> tuple[World, Segments]:
-    """Return the world with the lift of each episode, its other effects fitted again, and the flights in it."""
-    effect = load_effect(f"{SPIN_LIFT}@episode")
-    names = [parameter.name for parameter in effect.parameters]
-    mean = np.mean(list(found.values.values()), axis=0)
-    active = ActiveEffect.of(effect, dict(zip(names, mean.tolist(), strict=True)), bare.gravity[0, :1])
-    own = dict(bare.own_values)
-    for episode, values in found.values.items():
-        mine = {f"{effect.name}.{name}": float(value) for name, value in zip(names, values, strict=True)}
-        own[prepared.names[episode]] = {**own.get(prepared.names[episode], {}), **mine}
-    world = replace(bare, effects=(*bare.effects, active), own_values=own)
-    flight = replace(flight, observations=flight.observations.with_own(world)).in_world(world)
-    fitted = refit([fit_states(flight)], world, base_parameters(world, "flight"))
-    return fitted.world, fitted.segments[0]
+def _with(world: World, name: str) -> World:
+    """Return a world with an effect at neutral; itself for an empty name."""
+    return with_neutral(world, load_effect(name)) if name else world

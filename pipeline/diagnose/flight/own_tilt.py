@@ -32,6 +32,7 @@ from .form_families import OWN_TILTS
 from .other_forms import own_form
 from .own_accelerations import OwnAccelerations
 from .rest_tilts import rests_confirm
+from .specific_values import with_specific
 
 LIMITS = THRESHOLDS.verdict
 
@@ -184,19 +185,15 @@ def _with_own(prepared: Prepared, flight: Segments, world: World, name: str, std
     numbers = ("tilt_x", "tilt_y")
     columns = linear.columns([f"{name}.{number}" for number in numbers])
     mean = next(active for active in world.effects if active.effect.name == name).values
-    own = dict(world.own_values)
+    middle = np.array([float(mean[key][0]) for key in numbers])
+    own = {}
     for episode in np.unique(linear.episode).tolist():
         mine = linear.episode == episode
         information = linear.information[mine][:, columns][:, :, columns].sum(0) + np.eye(2) / std**2
         step = np.linalg.solve(information, linear.score[mine][:, columns].sum(0))
-        values = {f"{name}.{key}": float(mean[key][0] + s) for key, s in zip(numbers, step, strict=True)}
-        own[prepared.names[episode]] = {**own.get(prepared.names[episode], {}), **values}
-    tilt = ActiveEffect.of(
-        load_effect(f"{name}@episode"), {key: float(mean[key][0]) for key in numbers}, world.gravity[0, :1]
-    )
+        own[prepared.names[episode]] = middle + step
     others = tuple(active for active in world.effects if active.effect.name != name)
-    world = replace(world, effects=(*others, tilt), own_values=own)
-    flight = replace(flight, observations=flight.observations.with_own(world)).in_world(world)
+    world, flight = with_specific(replace(world, effects=others), flight, f"{name}@episode", middle, own)
     return world, fit_states(flight)
 
 
