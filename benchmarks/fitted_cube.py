@@ -18,9 +18,7 @@ import numpy as np
 from cgwm.datasets.synthetic import fall, make_scene
 from cgwm.datasets.synthetic.dynamics import ContactTruth, draw_contact
 from cgwm.datasets.synthetic.objects import SolidObject, extrude
-from cgwm.pipeline.calibrate.stage import calibrate
-from cgwm.pipeline.fit import fit
-from cgwm.schemas import CalibrateConfig, PhysConfig, SplatConfig
+from fitted_images import fitted_images
 from hand import FRICTION, HALF_M, MASS_KG
 
 
@@ -48,14 +46,7 @@ def main() -> None:
     fall.make_object, fall.draw_contact = cube, contact
     capture = given.out / "capture"
     make_scene("fall", capture, given.seed, splits=("train",), photo_size=(640, 480), video_size=(480, 360), photos=32)
-    calibrate(capture, CalibrateConfig(max_features=2048, seed=given.seed))
-    found = fit(
-        capture,
-        given.out / "model",
-        splat_config=SplatConfig(seed=given.seed),
-        phys_config=PhysConfig(supervise="images", population=48, generations=5, iterations=6, seed=given.seed),
-    )
-    numbers = {one.name: (one.estimate, one.std_error) for one in found.parameters}
+    numbers = fitted_images(capture, given.out / "model", given.seed)
     truth = {"mass_kg": MASS_KG, "side_m": 2 * HALF_M, **asdict(contact(np.random.default_rng([given.seed, 2])))}
     (given.out / "truth.json").write_text(json.dumps({"truth": truth, "found": numbers}, indent=1) + "\n")
     print(json.dumps(numbers))

@@ -17,9 +17,8 @@ from pathlib import Path
 from cgwm.datasets.synthetic import read_truth
 from cgwm.datasets.synthetic.dynamics import FINGERTIP, FINGERTIP_RADIUS
 from cgwm.datasets.synthetic.objects import write_parts
-from cgwm.pipeline.calibrate.stage import calibrate
-from cgwm.pipeline.fit import fit
-from cgwm.schemas import CalibrateConfig, ControlTask, PhysConfig, SplatConfig, task_toml
+from cgwm.schemas import ControlTask, task_toml
+from fitted_images import fitted_images
 from tabletop.capture import make_capture
 from tabletop.objects import load_item
 
@@ -50,14 +49,7 @@ def main() -> None:
     )
     (given.out / "push.toml").write_text(task_toml(task), encoding="utf-8")
     (capture / "cameras.json").unlink()  # the true ones
-    calibrate(capture, CalibrateConfig(max_features=2048, seed=given.seed))
-    found = fit(
-        capture,
-        given.out / "model",
-        splat_config=SplatConfig(seed=given.seed),
-        phys_config=PhysConfig(supervise="images", population=48, generations=5, iterations=6, seed=given.seed),
-    )
-    numbers = {one.name: (one.estimate, one.std_error) for one in found.parameters}
+    numbers = fitted_images(capture, given.out / "model", given.seed)
     print(json.dumps({"found": numbers, "friction": contact.friction, "of the finger": contact.friction_fingertip}))
 
 
