@@ -1,6 +1,7 @@
 """Planar push to a pose: cgwm's controller beside rivals, on MuJoCo with the true mesh.
 
-python benchmarks/control.py run [--objects t_block,mug] [--seeds 20] [--contenders mppi,cem] [--clock real|ideal|cpu]
+python benchmarks/control.py run [--objects t_block,mug] [--first 0] [--seeds 20] [--contenders mppi,cem]
+       [--clock real|ideal|cpu]
 python benchmarks/control.py run --fits FOLDER --contenders "true,fitted,fitted + draws" [--plants all]
 python benchmarks/control.py table
 
@@ -467,6 +468,7 @@ def main() -> None:
     parser.add_argument("--objects", default=",".join(OBJECTS))
     parser.add_argument("--contenders", default="mppi,both,gauss-newton,cem,cem + pushes,open loop,greedy")
     parser.add_argument("--clock", choices=("real", "ideal", "cpu"), default="real")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--fits", type=Path, default=None, help="folder of outputs of 'cgwm demo --scene control'")
     parser.add_argument("--plants", default="nominal", help="names of PLANTS, or all")
@@ -483,7 +485,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         scenes = [scene(name, Path(folder), given.fits) for name in given.objects.split(",")]
         plants = PLANTS if given.plants == "all" else given.plants.split(",")
-        for seed in range(given.seeds):
+        for seed in range(given.first, given.first + given.seeds):
             for plant, one in product(plants, scenes):
                 error, changed = "" if plant == "nominal" else f" | {plant}", with_error(one, plant)
                 for name in given.contenders.split(","):
