@@ -22,6 +22,11 @@ UNREAD_SUFFIXES = (
 """Suffixes of images that are not read, in lower case."""
 HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1")
 """First brands of HEIF files (ISO/IEC 23008-12), at byte 8; phones and clouds name some of them .jpg."""
+_OTHER_KINDS = (
+    (0, b"RIFF", "WebP"), (0, b"II*\0", "TIFF"), (0, b"MM\0*", "TIFF"), (0, b"GIF8", "GIF"), (0, b"BM", "BMP"),
+    (4, b"ftypavif", "AVIF"), (4, b"JXL ", "JPEG XL"), (0, b"\xff\x0a", "JPEG XL"),
+)  # fmt: skip
+"""Where files of other kinds begin with what; some pages and messengers name them .jpg."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG."""
@@ -164,10 +169,7 @@ def _size(path: Path, data: bytes) -> tuple[int, int]:
         elif data.startswith(b"\xff\xd8"):
             width, height = _jpeg_size(data)
         else:
-            is_heif = data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS
-            raise ValueError(
-                "HEIC, whatever its name ('cgwm import photos' converts it)" if is_heif else "neither PNG nor JPEG"
-            )
+            raise ValueError(_other_kind(data))
     except (struct.error, IndexError):
         raise _undecodable(path, data, "truncated") from None
     except ValueError as error:
@@ -179,6 +181,14 @@ def _size(path: Path, data: bytes) -> tuple[int, int]:
             _REPLACE,
         )
     return width, height
+
+
+def _other_kind(data: bytes) -> str:
+    """Return what a file is that is neither PNG nor JPEG, and what makes it one."""
+    if data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS:
+        return "HEIC, whatever its name ('cgwm import photos' converts it)"
+    kind = next((kind for at, start, kind in _OTHER_KINDS if data[at : at + len(start)] == start), None)
+    return f"{kind}, whatever its name: save it as JPEG or PNG" if kind else "neither PNG nor JPEG"
 
 
 def _undecodable(path: Path, data: bytes, reason: str) -> InputDataError:

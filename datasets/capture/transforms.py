@@ -120,7 +120,8 @@ def _intrinsics(where: str, fields: dict[str, Any], image: Path) -> CameraIntrin
     if "w" in values and "h" in values:
         width, height = round(values["w"]), round(values["h"])
     else:
-        width, height = image_size(image if image.exists() else image.parent / "images" / image.name)
+        places = (image, image.parent / "images" / image.name)
+        width, height = image_size(next((place for place in places if place.exists()), image))
     fx, fy = _focal_lengths(where, values, width, height)
     distortion = tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     return CameraIntrinsics.of_lens(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -110,7 +111,7 @@ def _no_photos(folder: Path) -> InputDataError:
     entries = entries_of(folder)
     others = sorted({path.suffix for path in entries if path.suffix})
     posed = any(path.name == "transforms.json" for path in entries)
-    within = [str(path) for path in entries if path.is_dir() and _holds_photos(path)]
+    within = [str(path) for path in entries if path.is_dir() and _photos_within(path)]
     todo = "name the folder that holds them"
     if within:
         several = f" and {len(within) - 1} more; copy them into one folder" if len(within) > 1 else ""
@@ -124,8 +125,19 @@ def _no_photos(folder: Path) -> InputDataError:
     )
 
 
-def _holds_photos(folder: Path) -> bool:
-    return any(path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for path in entries_of(folder))
+def left_in(folder: Path) -> list[str]:
+    """Return what stays behind in a folder whose photos were taken: photos of other kinds, and those in its folders."""
+    entries = entries_of(folder)
+    suffixes = Counter(path.suffix.lower() for path in entries)
+    others = [f"{suffixes[one]} {one}" for one in UNREAD_SUFFIXES if suffixes[one] and one not in HEIF_SUFFIXES]
+    notes = [f"left out: {', '.join(others)} (save photos of these kinds as JPEG)"] if others else []
+    counts = {path.name: _photos_within(path) for path in entries if path.is_dir()}
+    within = [f"{count} in {name}/" for name, count in counts.items() if count]
+    return [*notes, *([f"left out: photos in folders, {', '.join(within)} (copy them into one)"] if within else [])]
+
+
+def _photos_within(folder: Path) -> int:
+    return sum(path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for path in entries_of(folder))
 
 
 def require_distinct(photos: Iterable[Photo]) -> None:

@@ -8,7 +8,7 @@ from ...schemas.imports import ImportResult
 from ..capture.files import repeated
 from ..io.atomic import new_directory
 from ..io.outputs import reads
-from .photo_captures import copy_photos, photos_in, require_unpacked, write_photo_capture
+from .photo_captures import copy_photos, left_in, photos_in, require_unpacked, write_photo_capture
 
 
 @reads("source")
@@ -28,9 +28,11 @@ def import_photos(source: Path | str, out: Path | str, overwrite: bool = False) 
         UsageError: If `out` exists, before anything is read.
     """
     with new_directory(out, "capture", overwrite) as directory:
-        photos = photos_in(require_unpacked(Path(source)))
+        source = require_unpacked(Path(source))
+        photos = photos_in(source)
         again = repeated([photo.source for photo in photos])
         photos = [photo for photo in photos if photo.source not in again]
         copy_photos(directory, photos)
         notes = [f"{copy.name} is the same file as {first.name} and was left out" for copy, first in again.items()]
+        notes += left_in(source)
         return write_photo_capture(directory, out, len(photos), warnings=notes)

@@ -184,6 +184,31 @@ def test_a_photo_that_is_there_twice_is_taken_once(tmp_path: Path) -> None:
     assert Capture.open(tmp_path / "out").photos() == ["IMG 1.jpg", "IMG 2.jpg"]
 
 
+def test_photos_that_stay_behind_are_told(tmp_path: Path) -> None:
+    _photos(tmp_path / "in", ["1.jpg", "2.jpg"])
+    _photos(tmp_path / "in" / "older", ["3.jpg"])
+    (tmp_path / "in" / "4.DNG").write_bytes(b"raw")
+    (tmp_path / "in" / "1.MOV").write_bytes(b"a live photo's film")
+    result = import_photos(tmp_path / "in", tmp_path / "out")
+    assert result.photos == 2
+    raw, folders = result.warnings
+    assert raw == "left out: 1 .dng (save photos of these kinds as JPEG)" and "1 in older/" in folders
+
+
+def test_a_photo_of_another_kind_under_the_name_of_a_jpeg_is_named(tmp_path: Path) -> None:
+    _photos(tmp_path / "in", ["1.jpg"])
+    (tmp_path / "in" / "2.jpg").write_bytes(b"RIFF\x10\0\0\0WEBPVP8 ")
+    with pytest.raises(InputDataError, match=r"2\.jpg: .* WebP, whatever its name: save it as JPEG or PNG"):
+        import_photos(tmp_path / "in", tmp_path / "out")
+
+
+def test_a_transforms_json_without_sizes_names_the_photo_that_is_missing(tmp_path: Path) -> None:
+    frame = {"file_path": "images/0001.jpg", "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": [frame]}))
+    with pytest.raises(InputDataError, match=r"images/0001\.jpg: no such file"):
+        import_nerfstudio(tmp_path, tmp_path / "out")
+
+
 def test_a_walk_gives_sharp_frames_at_equal_distances(tmp_path: Path) -> None:
     write_walk(tmp_path / "walk.mp4")
     result = import_video(tmp_path / "walk.mp4", tmp_path / "out", photos=6)
