@@ -60,7 +60,7 @@ def admissible(
     driven = any(body.motion == "driven" for body in world.bodies)
     has = {
         "ground": world.ground_normal is not None,
-        "contact": world.ground_normal is not None or len(world.bodies) > 1,
+        "contact": world.ground_normal is not None or len(world.bodies) > 1 or bool(world.surfaces),
         "spin": turned or spun,
         "unmeasured_spin": not (turned or spun),
         "orientation": turned,

@@ -157,8 +157,8 @@ class _Predicted:
             gravity = self.world.gravity.flatten()[-3:]
             up = ", ".join(f"{-float(part) + 0.0:.6g}" for part in gravity / gravity.norm())
             return (
-                "the model has nothing to touch: no ground, and no other body. Add [world] ground to capture.toml: "
-                f"ground = {{ normal = [{up}], offset_m = 0 }}"
+                "the model has nothing to touch: no ground, no surface and no other body. Add [world] ground to "
+                f"capture.toml: ground = {{ normal = [{up}], offset_m = 0 }}"
             )
         if nearest > LIMITS.near_sizes * self.size_m:
             return (
@@ -172,8 +172,9 @@ class _Predicted:
             )
         if others and self._sinks():
             return (
-                f"the body falls through: the colliding spheres of '{others[0]}' leave gaps. Cover it with more of "
-                "them (--set sg-gs.max_collision_spheres=N), and look at them with cgwm view"
+                f"the body falls through: the colliding spheres of '{others[0]}' leave gaps. If it does not move, give "
+                "its mesh in capture.toml as one of the [[surfaces]], whose triangles are touched exactly, in place of "
+                "the body; or cover it with more spheres (--set sg-gs.max_collision_spheres=N)"
             )
         return "a wrong shape, ground or start; look at the motion with cgwm compare"
 

@@ -301,7 +301,7 @@ def _mark_supported_frames(state: _State) -> None:
 
 def _touches_nothing(world: World) -> bool:
     """Return whether the world has nothing that its body could touch."""
-    return world.ground_normal is None and len(world.bodies) == 1
+    return world.ground_normal is None and len(world.bodies) == 1 and not world.surfaces
 
 
 def _remove_outliers(state: _State) -> None:

@@ -43,7 +43,7 @@ def test_a_ground_that_is_too_low_or_missing_is_the_likely_cause() -> None:
     assert low is not None and low.never_touches and "ground lies too low" in low.cause
     assert low.sentence.startswith("The model does not describe this motion: nothing touches anything in it")
     none = not_described(world_with("ball", ground=False), episodes, NOISE)
-    assert none is not None and none.never_touches and "no ground, and no other body" in none.cause
+    assert none is not None and none.never_touches and "no ground, no surface and no other body" in none.cause
     flights = tosses(world_with("ball", ground=False), 5, count=7, duration_s=0.3)
     assert not_described(world_with("ball", ground=False), [episodes[0], *flights], NOISE) is None
 
@@ -65,7 +65,7 @@ def test_a_body_that_falls_between_spheres_of_a_rail_is_told() -> None:
     gaps = replace(world, bodies=(ball, row_of_spheres(0.08)))
     found = not_described(gaps, episodes, NOISE)
     assert found is not None and found.worse_than == "steady"
-    assert "the colliding spheres of 'rail' leave gaps" in found.cause
+    assert "the colliding spheres of 'rail' leave gaps" in found.cause and "[[surfaces]]" in found.cause
 
 
 def row_of_spheres(apart_m: float) -> Body:

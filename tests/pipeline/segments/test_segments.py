@@ -1,6 +1,7 @@
 """Segments: their degrees of freedom, states of straight lines, and what a linearization weighs."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -20,6 +21,7 @@ from cgwm.pipeline.segments.segments import Segments, _line
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.segmentation import Segment
 from cgwm.pipeline.trajectories.track_noise import Noise
+from helpers.fixed_surfaces import box
 from helpers.worlds import F64, ball_body, world_of
 
 BEGIN_S, RATE_HZ, FRAMES = 7.0, 100.0, 12
@@ -193,3 +195,18 @@ def test_frames_that_something_supports_are_cut_anew_before_the_noise_is_measure
     prepare_module._mark_supported_frames(state)  # pyright: ignore[reportArgumentType]
     assert steps == [mask, ["flight"]] and state.supported is mask
     assert state.warnings[0].startswith("2 frames look airborne")
+
+
+def test_contact_with_a_surface_is_contact_where_there_is_no_ground() -> None:
+    """A ball of which the centre alone is measured slides along the top of a fixed box, in a world without ground."""
+    ball = ball_body(0.02)
+    t = np.arange(60) / 120
+    noise = np.random.default_rng(0).normal(0, 1e-4, (2, len(t), 3))
+    place = np.stack([0.2 * t, 0 * t, 0 * t + 0.02], 1)
+    episodes = [(f"e{k}", {"ball": Track(t, place * (1 - 2 * k, 1, 1) + noise[k], None)}) for k in range(2)]
+    table = box((1.0, 1.0, 0.1), position=(0, 0, -0.1))
+    world = world_of(ball, ground=False)
+    bare = prepare_module.prepare(world, episodes)
+    found = prepare_module.prepare(replace(world, surfaces=(table,)), episodes)
+    assert not bare.contact_items and bare.flight is not None
+    assert {item.episode for item in found.contact_items} == {0, 1} and found.flight is None
