@@ -22,11 +22,12 @@ from ...physics.world import World
 from ...segments.candidates import base_values
 from ...segments.first_contact_fit import EffectEstimate, placed
 from ...segments.fitted_parameters import fitted_parameter
+from ...segments.flights.shaped_errors import no_narrower
 from ...segments.flights.slow_errors import slow_errors
 from ...segments.impacts.fit import BASE, ImpactBase, fit_impacts
 from ...segments.impacts.velocities import measured_impacts
 from ...segments.prepare import Prepared, prepare
-from ...segments.segment_fit import linearised, refit
+from ...segments.segment_fit import projected, refit
 from ...segments.session_spread import beside_sessions
 from ...segments.sliding.descent import information_by_segment
 from ...segments.sliding.fit import StartedSliding, contact_effect_parameters, fit_sliding, nuisance_parameters
@@ -76,7 +77,8 @@ def fit_effect_flights(
     # an error of the steps is common to all frames, whose number makes the noise small beside it
     short = replace(found.segments[0], in_short_steps=True)
     found = refit([short], world, names, found.values, ITERATIONS)
-    linear = linearised(found.segments[0], names, found.values)
+    rows, jacobian = found.segments[0].residuals(names, found.values)
+    linear = projected(found.segments[0], rows, jacobian, len(names))
     prior = torch.diag(torch.tensor([1 / p.prior[1] ** 2 for p in names])).to(start).numpy()
     information = linear.information.sum(0).numpy()
     # the error of an effect's formula is common to all frames of an episode
@@ -89,6 +91,7 @@ def fit_effect_flights(
     beside = beside_sessions(found.segments[0], names, values, sessions, excess)
     if beside is not None:
         values, covariance = torch.from_numpy(beside.values).to(values), beside.covariance
+    covariance = no_narrower(covariance, rows, jacobian, prior)
     with np.errstate(invalid="ignore"):
         std = np.sqrt(np.diag(covariance))
     share = SEGMENT_THRESHOLDS.preparation.unobservable_share
