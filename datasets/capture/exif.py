@@ -9,6 +9,9 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ...schemas.regular_files import read_binary_file
 
 Value = str | float
@@ -47,24 +50,27 @@ def upright_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
     return (height, width) if _orientation(path) >= 5 else size
 
 
-def box_in_file(
-    path: Path, box: tuple[float, float, float, float], size: tuple[int, int]
-) -> tuple[float, float, float, float]:
-    """Return a box (left, upper, right, lower) [px] of an upright photo in the pixels of its file.
+def upright_in_file(path: Path) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return where an upright photo's right and its lower side are in its file: steps along columns and rows."""
+    orientation = _orientation(path)
+    column, row = -1.0 if orientation in _FROM_RIGHT else 1.0, -1.0 if orientation in _FROM_BELOW else 1.0
+    return ((0.0, row), (column, 0.0)) if orientation >= 5 else ((column, 0.0), (0.0, row))
 
-    Args:
-        path: The photo, which viewers turn and mirror as its orientation says (CIPA DC-008-2019, section 4.6.4).
-        box: The box as a viewer shows it.
-        size: Width and height of the photo in the file [px].
-    """
-    orientation, (width, height) = _orientation(path), size
-    corners = []
-    for x, y in (box[:2], box[2:]):
-        across, down = (y, x) if orientation >= 5 else (x, y)
-        corners.append((width - across if orientation in _FROM_RIGHT else across,
-                        height - down if orientation in _FROM_BELOW else down))  # fmt: skip
-    (x0, y0), (x1, y1) = corners
-    return min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1)
+
+def turned_upright(path: Path, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image (H, W) or (H, W, 3) with the pixels of a photo's file as viewers show it."""
+    orientation, own = _orientation(path), _own_order(path, image)
+    return np.ascontiguousarray(np.swapaxes(own, 0, 1) if orientation >= 5 else own)
+
+
+def turned_as_file(path: Path, image: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return an image (H, W) of an upright photo with the pixels of the photo's file."""
+    return np.ascontiguousarray(_own_order(path, image.T if _orientation(path) >= 5 else image))
+
+
+def _own_order(path: Path, image: NDArray) -> NDArray:
+    orientation = _orientation(path)
+    return image[:: -1 if orientation in _FROM_BELOW else 1, :: -1 if orientation in _FROM_RIGHT else 1]
 
 
 def _orientation(path: Path) -> int:

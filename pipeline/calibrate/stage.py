@@ -14,6 +14,7 @@ import numpy as np
 
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.check import check_capture
+from ...datasets.capture.exif import upright_in_file
 from ...datasets.capture.sparse_points import POINTS_NAME, write_points
 from ...datasets.io.atomic import sha256, temporary_directory
 from ...datasets.io.file_set import new_files, settle_files
@@ -200,7 +201,7 @@ def _world(capture: Capture, model: SfmModel) -> tuple[MetricFrame | None, Simil
     if ground is None:
         gravity = np.array(capture.manifest.world.gravity_m_s2)
         up = -gravity / np.linalg.norm(gravity) if gravity.any() else np.array([0.0, 0.0, 1.0])
-        return frame, *_upright(model, similarity, up), warnings
+        return frame, *_upright(capture, model, similarity, up), warnings
     normal = np.array(ground.normal)
     motion = ground_frame(model.transformed(similarity), normal)
     if motion is None:
@@ -208,20 +209,22 @@ def _world(capture: Capture, model: SfmModel) -> tuple[MetricFrame | None, Simil
             "no plane was found that could be the ground: the axes and the origin of the world are arbitrary; "
             "give a marker with a pose"
         )
-        return frame, *_upright(model, similarity, normal), warnings
+        return frame, *_upright(capture, model, similarity, normal), warnings
     height = ground.offset_m * normal if frame else np.zeros(3)
     combined = similarity.then(Similarity(1.0, motion.rotation, motion.translation + height))
     words = "the dominant plane of the sparse points is the ground; the origin and the x axis on it are arbitrary"
     return frame, combined, words, warnings
 
 
-def _upright(model: SfmModel, similarity: Similarity, up: Array) -> tuple[Similarity, str]:
+def _upright(capture: Capture, model: SfmModel, similarity: Similarity, up: Array) -> tuple[Similarity, str]:
     """Return the transform into a world whose vertical is that of the photos, and what fixes the world."""
-    motion = upright_frame(model.transformed(similarity), up)
+    photos = capture.photos()
+    sides = {name: upright_in_file(capture.root / "images" / name) for name in photos if name in model.T_cam_world}
+    motion = upright_frame(model.transformed(similarity), up, sides)
     if motion is None:
         return similarity, "that of structure from motion: arbitrary axes and origin"
     return similarity.then(motion), (
-        "that of structure from motion: arbitrary axes and origin; the photos' rows of pixels are taken to be level"
+        "that of structure from motion: arbitrary axes and origin; photos, as viewers show them, are taken to be level"
     )
 
 

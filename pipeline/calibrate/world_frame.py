@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from .reconstruction import Array, SfmModel, Similarity
@@ -18,6 +20,9 @@ _LEAST_SPREAD = 0.02
 and do not tell by how much cameras look down."""
 _LEAST_UPRIGHT = 0.5
 """Least length of the mean of the cameras' up directions: photos on their side or from below and above cancel it."""
+Sides = tuple[tuple[float, float], tuple[float, float]]
+"""Where a photo's right and its lower side, as viewers show it, are in its file: steps along columns and rows."""
+_AS_THE_FILE: Sides = ((1.0, 0.0), (0.0, 1.0))
 
 
 def ground_frame(model: SfmModel, normal_world: Array, seed: int = 0) -> Similarity | None:
@@ -45,7 +50,7 @@ def ground_frame(model: SfmModel, normal_world: Array, seed: int = 0) -> Similar
     return Similarity(1.0, rotation, -rotation @ origin)
 
 
-def upright_frame(model: SfmModel, up_world: Array) -> Similarity | None:
+def upright_frame(model: SfmModel, up_world: Array, sides: Mapping[str, Sides]) -> Similarity | None:
     """Return the rotation that puts the cameras upright: rows of pixels, which people hold level, become horizontal.
 
     A camera may look down or up without turning this direction, in which the cameras' rows have least extent. Of
@@ -55,12 +60,13 @@ def upright_frame(model: SfmModel, up_world: Array) -> Similarity | None:
     Args:
         model: The model, in any frame.
         up_world: The vertical of the world frame, unit vector, shape (3,).
+        sides: How photos are turned that are not shown as their file has them.
 
     Returns:
         The transform, of scale 1 about the origin, or None if the photos were taken at all angles.
     """
-    poses = np.array([*model.T_cam_world.values()])
-    rows, mean = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0)
+    shown = [np.array(sides.get(name, _AS_THE_FILE)) @ pose[:2, :3] for name, pose in model.T_cam_world.items()]
+    rows, mean = np.array([right for right, _ in shown]), -np.mean([down for _, down in shown], axis=0)
     if np.linalg.norm(mean) < _LEAST_UPRIGHT:
         return None
     up = mean / np.linalg.norm(mean)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.capture.capture import Capture
-from ...datasets.capture.exif import box_in_file, upright_size
+from ...datasets.capture.exif import turned_as_file, turned_upright, upright_size
 from ...datasets.capture.files import entries_of
 from ...datasets.capture.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, image_size, read_rgb, write_image
 from ...datasets.io.atomic import new_directory
@@ -82,13 +82,14 @@ def mask(
         given = _photos(Path(source), body)
         reference = _reference(given, photo)
         if box is not None:
-            box = _box_in_file(given, reference, box)
-        small = [_reduced(read_rgb(given.folder / name)) for name in progress(given.names, "photos", unit="photo")]
+            _require_inside(given, reference, box)
+        small = [_upright(given.folder / name) for name in progress(given.names, "photos", unit="photo")]
         method, masks = _masks(given, small, reference, box)
         report = masks_report(method, given.body, given.label, given.names, masks)
         for name, found in zip(given.names, masks, strict=True):
             width, height = image_size(given.folder / name)
-            large = cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+            in_file = turned_as_file(given.folder / name, found)
+            large = cv2.resize(in_file.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
             path = (directory / name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
             write_image(path, np.where(large, given.label, 0).astype(np.uint8))
@@ -162,13 +163,9 @@ def _reference(given: _Photos, photo: str | None) -> int:
     return given.names.index(photo)
 
 
-def _box_in_file(
-    given: _Photos, reference: int, box: tuple[float, float, float, float]
-) -> tuple[float, float, float, float]:
-    """Return a box that was read off an upright photo in the pixels of the photo's file."""
-    path = given.folder / given.names[reference]
-    size = image_size(path)
-    width, height = upright_size(path, size)
+def _require_inside(given: _Photos, reference: int, box: tuple[float, float, float, float]) -> None:
+    """Refuse a box that is not inside its photo, as viewers show it."""
+    width, height = _shown_size(given, reference)
     left, upper, right, lower = box
     if not (0 <= left < right <= width and 0 <= upper < lower <= height):
         raise UsageError(
@@ -177,7 +174,16 @@ def _box_in_file(
             "x0,y0,x1,y1 with x0 < x1 and y0 < y1: left, upper, right and lower border.",
             "read them off in an image viewer, with some pixels of the background all around the body.",
         )
-    return box_in_file(path, box, size)
+
+
+def _shown_size(given: _Photos, photo: int) -> tuple[int, int]:
+    path = given.folder / given.names[photo]
+    return upright_size(path, image_size(path))
+
+
+def _upright(path: Path) -> NDArray[np.uint8]:
+    """Return a photo reduced, as viewers show it: neighbours are compared, whose files may be turned differently."""
+    return turned_upright(path, _reduced(read_rgb(path)))
 
 
 def _reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -192,7 +198,7 @@ def _masks(
     given: _Photos, small: list[NDArray[np.uint8]], reference: int, box: tuple[float, float, float, float] | None
 ) -> tuple[str, list[Mask]]:
     if box is not None:
-        scale = small[reference].shape[1] / image_size(given.folder / given.names[reference])[0]
+        scale = small[reference].shape[1] / _shown_size(given, reference)[0]
         left, upper, right, lower = (scale * value for value in box)
         return "box", from_box(small, reference, (left, upper, right, lower))
     for method, found in (("plain", before_plain), ("turntable", on_turntable)):

@@ -244,7 +244,7 @@ def test_photos_are_upright_where_nothing_tells_the_world(world, model, count):
     """An arc of cameras that look down at the scene: the mean of their up directions leans, their rows do not."""
     up = np.array([0.0, 0.0, 1.0])
     arc = replace(model, T_cam_world=dict([*model.T_cam_world.items()][:count]))
-    motion = upright_frame(arc, up)
+    motion = upright_frame(arc, up, {})
     assert motion is not None and motion.scale == 1.0
     turned = arc.transformed(motion)
     rows = np.array([pose[0, :3] for pose in turned.T_cam_world.values()])
@@ -260,4 +260,15 @@ def test_photos_at_all_angles_are_not_made_upright(world):
         )
         for k, (name, pose) in enumerate(world.T_cam_world.items())
     }
-    assert upright_frame(replace(world, T_cam_world=rolled), np.array([0.0, 0.0, 1.0])) is None
+    assert upright_frame(replace(world, T_cam_world=rolled), np.array([0.0, 0.0, 1.0]), {}) is None
+
+
+def test_portrait_photos_are_upright_as_viewers_show_them(model):
+    """The files of a phone that is held upright lie on their side, which their EXIF data say."""
+    up, on_side = np.array([0.0, 0.0, 1.0]), np.eye(4)
+    on_side[:3, :3] = rotation_about([0, 0, 1], -np.pi / 2)  # the file's columns run down
+    lying = replace(model, T_cam_world={name: on_side @ pose for name, pose in model.T_cam_world.items()})
+    as_shown = upright_frame(lying, up, dict.fromkeys(lying.T_cam_world, ((0.0, -1.0), (1.0, 0.0))))
+    expected = upright_frame(model, up, {})
+    assert as_shown is not None and expected is not None
+    np.testing.assert_allclose(as_shown.rotation, expected.rotation, atol=1e-9)

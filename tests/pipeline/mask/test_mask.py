@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from cgwm.cli.mask import _summary
-from cgwm.datasets.capture.exif import box_in_file, upright_size
+from cgwm.datasets.capture.exif import turned_as_file, turned_upright, upright_in_file, upright_size
 from cgwm.datasets.capture.images import read_label, write_image
 from cgwm.pipeline.mask import mask, mask_videos
 from cgwm.pipeline.mask.doubts import doubts
@@ -68,21 +68,44 @@ def test_the_body_is_cut_out(tmp_path: Path, behind: str, box: None, method: str
     assert validate(tmp_path / "masks").faults == ()
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_box_is_read_off_the_upright_photo(tmp_path: Path, orientation: int) -> None:
-    image = np.zeros((40, 60, 3), np.uint8)
-    image[8:20, 30:54] = 255
-    write_image(tmp_path / "plain.jpg", image)
+def turn(path: Path, orientation: int) -> None:
+    """Give a JPEG an EXIF orientation."""
     entry = struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
     exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + entry
-    data = (tmp_path / "plain.jpg").read_bytes()
-    path = tmp_path / "turned.jpg"
+    data = path.read_bytes()
     path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_are_turned_as_viewers_turn_them(tmp_path: Path, orientation: int) -> None:
+    image = np.zeros((40, 60, 3), np.uint8)
+    image[8:20, 30:54] = 255
+    write_image(path := tmp_path / "turned.jpg", image)
+    turn(path, orientation)
     shown = cv2.imread(str(path), cv2.IMREAD_COLOR)  # OpenCV turns a photo as viewers do
     assert shown is not None and upright_size(path, (60, 40)) == shown.shape[1::-1]
-    y, x = np.nonzero(shown[..., 0] > 128)
-    box = (float(x.min()), float(y.min()), float(x.max() + 1), float(y.max() + 1))
-    assert box_in_file(path, box, (60, 40)) == (30, 8, 54, 20)
+    assert ((turned_upright(path, image) > 128) == (shown > 128)).all()
+    assert (turned_as_file(path, shown[..., 0] > 128) == (image[..., 0] > 128)).all()
+    right, lower = (np.array(side) for side in upright_in_file(path))
+    # the middle of what is bright lies right of and above the middle of the picture, or as the file is turned
+    in_file = np.array([42, 14]) - [30, 20]
+    y, x = (values.mean() for values in np.nonzero(shown[..., 0] > 128))
+    middle = np.array([x + 0.5, y + 0.5]) - np.array(shown.shape[1::-1]) / 2
+    assert (in_file @ right, in_file @ lower) == pytest.approx(tuple(middle))
+
+
+def test_a_box_holds_the_body_in_photos_whose_files_are_turned_differently(tmp_path: Path) -> None:
+    photos, discs = scene("what moves")
+    (tmp_path / "photos").mkdir()
+    for k, photo in enumerate(photos):
+        path = tmp_path / "photos" / f"{k}.jpg"
+        write_image(path, np.rot90(photo, 1).copy() if k % 2 == 0 else photo, 97)
+        if k % 2 == 0:
+            turn(path, 6)
+    mask(tmp_path / "photos", tmp_path / "masks", BOX)
+    for k, disc in enumerate(discs):
+        found, true = read_label(tmp_path / "masks" / f"{k}.png") > 0, np.rot90(disc, 1) if k % 2 == 0 else disc
+        assert (found & true).sum() / (found | true).sum() > 0.85
 
 
 def test_a_capture_gets_the_label_of_its_body(tmp_path: Path) -> None:
