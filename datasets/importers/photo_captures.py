@@ -23,6 +23,7 @@ from ..io.progress import progress
 
 HEIF_SUFFIXES = (".heic", ".heif")
 """Suffixes of photos that are converted, in lower case."""
+_VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".webm", ".avi", ".mkv")
 _QUALITY = 97
 """JPEG quality of a converted photo: what it loses lies below the noise of the sensor."""
 
@@ -98,7 +99,9 @@ def _require_folder(folder: Path) -> None:
     if folder.is_dir():
         return
     is_file = folder.is_file()
-    todo = f"name the folder that holds the photos (a video: cgwm import video {typed_path(folder)})."
+    todo = "name the folder that holds the photos"
+    is_photo = folder.suffix.lower() in (*IMAGE_SUFFIXES, *UNREAD_SUFFIXES)
+    todo += "." if is_photo else f" (a video: cgwm import video {typed_path(folder)})."
     raise InputDataError(
         f"{folder}: {'is a file' if is_file else 'no such folder'}.",
         "a folder of photos.",
@@ -116,6 +119,8 @@ def _no_photos(folder: Path) -> InputDataError:
     if within:
         several = f" and {len(within) - 1} more; copy them into one folder" if len(within) > 1 else ""
         todo += f": {within[0]}{several}"
+    elif videos := [path for path in entries if path.suffix.lower() in _VIDEO_SUFFIXES]:
+        todo += f"; of a video: cgwm import video {typed_path(videos[0])} --out CAPTURE"
     elif any(suffix.lower() in UNREAD_SUFFIXES for suffix in others):
         todo = "save them as JPEG with a picture program, at their size and with their EXIF data"
     return InputDataError(

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from ...schemas import InputDataError
 from ...schemas.imports import ImportResult
+from ...schemas.printable import typed_path
 from ...schemas.regular_files import require_regular_file
-from ..capture.images import write_image
+from ..capture.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, write_image
 from ..capture.video import frames_of
 from ..io.atomic import new_directory
 from ..io.outputs import reads
@@ -63,13 +64,26 @@ def import_video(source: Path | str, out: Path | str, photos: int = 60, overwrit
     """
     source = Path(source)
     with new_directory(out, "capture", overwrite) as directory:
-        require_regular_file(source)
+        _require_video(source)
         chosen, blurred = sharp_frames(source, measured(frames_of(source)), photos)
         _write(source, directory, chosen)
         notes = ["a phone reads a picture row by row (rolling shutter), which bends fast turns: walk slowly"]
         if blurred:
             notes.append(f"{blurred} of {photos} parts of the video have no sharp frame")
         return write_photo_capture(directory, out, len(chosen), warnings=notes)
+
+
+def _require_video(source: Path) -> None:
+    """Refuse a folder, and a photo."""
+    is_photo = source.suffix.lower() in (*IMAGE_SUFFIXES, *UNREAD_SUFFIXES)
+    if source.is_dir() or (is_photo and source.is_file()):
+        folder = source.parent if is_photo else source
+        raise InputDataError(
+            f"{source}: is a {'photo' if is_photo else 'folder'}.",
+            "one video, of a walk around the scene.",
+            f"name the video; photos are imported by 'cgwm import photos {typed_path(folder)} --out CAPTURE'.",
+        )
+    require_regular_file(source)
 
 
 def sharp_frames(source: Path, figures: FrameFigures, most: int) -> tuple[list[int], int]:

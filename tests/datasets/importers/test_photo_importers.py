@@ -184,6 +184,19 @@ def test_a_photo_that_is_there_twice_is_taken_once(tmp_path: Path) -> None:
     assert Capture.open(tmp_path / "out").photos() == ["IMG 1.jpg", "IMG 2.jpg"]
 
 
+def test_videos_and_photos_are_told_apart(tmp_path: Path) -> None:
+    _photos(tmp_path / "in", ["1.jpg"])
+    for source in (tmp_path / "in", tmp_path / "in" / "1.jpg"):
+        with pytest.raises(InputDataError, match=r"(?s)is a (folder|photo)\..*cgwm import photos .*in --out CAPTURE"):
+            import_video(source, tmp_path / "out")
+    (tmp_path / "films").mkdir()
+    (tmp_path / "films" / "walk.MOV").write_bytes(b"film")
+    for source in (tmp_path / "films", tmp_path / "films" / "walk.MOV"):
+        with pytest.raises(InputDataError, match=r"cgwm import video .*walk\.MOV"):
+            import_photos(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_photos_that_stay_behind_are_told(tmp_path: Path) -> None:
     _photos(tmp_path / "in", ["1.jpg", "2.jpg"])
     _photos(tmp_path / "in" / "older", ["3.jpg"])
