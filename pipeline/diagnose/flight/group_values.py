@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ...optimization.tails import student_tail
-from ...physics.parameters import Parameter, effect_parameters
+from ...physics.parameters import effect_parameters
 from ...physics.world import World
 from ...segments.candidates import Candidate, Variant, admissible, base_parameters, variants_of, without_effects
 from ...segments.linearization import Linearization, linearize
@@ -28,7 +27,7 @@ from ..evidence.effect_selection import SelectionStep
 from ..evidence.evidence import Evidence, prior_odds
 from ..evidence.score_test import canonical_correlation, solved
 from ..thresholds import THRESHOLDS
-from .specific_values import parameters_of, specific_evidence, with_neutral, with_specific
+from .specific_values import encoded, parameters_of, specific_evidence, values_of_each, with_neutral, with_specific
 
 LIMITS = THRESHOLDS.flight
 
@@ -324,22 +323,8 @@ def _refitted(
     """Return an effect's parameters by group, the chi2 of each flight (B,), and that of all with one value for all."""
     added = with_neutral(world, candidate.effect)
     own = parameters_of(added, candidate.effect.name)
-    values, cost = {}, np.zeros(len(groups))
-    mean = np.mean(list(start.values()), axis=0)
-    alone = refit([flight], added, own, _encoded(own, mean, flight))
-    for group, value in start.items():
-        mine = np.flatnonzero(groups == group)
-        part = flight.select(mine.tolist())
-        fitted = refit([part], added, own, _encoded(own, value, flight))
-        values[group] = np.array([fitted.number(parameter.name)[0] for parameter in own])
-        cost[mine] = fitted.by_segment[0].numpy()
-    return values, cost, alone.cost
-
-
-def _encoded(parameters: Sequence[Parameter], values: Array, flight: Segments) -> Tensor:
-    """Return values within the bounds of their parameters."""
-    kept = [float(np.clip(value, *p.bounds)) for p, value in zip(parameters, values, strict=True)]
-    return flight.dof.new_tensor(kept).double()
+    alone = refit([flight], added, own, encoded(own, np.mean(list(start.values()), axis=0), flight))
+    return *values_of_each(candidate.effect, world, flight, groups, start), alone.cost
 
 
 def _placed(prepared: Prepared, best: _Fitted, groups: NDArray[np.int64]) -> tuple[World, Segments]:

@@ -16,23 +16,24 @@ from ...optimization.tails import chi2_tail
 from ...physics.effects.effect import ActiveEffect
 from ...physics.effects.registry import load_effect
 from ...physics.world import World
-from ...segments.candidates import Candidate, base_parameters, variants_of
+from ...segments.candidates import Candidate, base_parameters, variants_of, without_effects
 from ...segments.flights.residual_wrench import residual_wrenches
 from ...segments.flights.slow_errors import SlowErrors
 from ...segments.linearization import linearize
 from ...segments.prepare import Prepared
-from ...segments.segment_fit import refit
+from ...segments.segment_fit import Refit, refit
 from ...segments.segment_states import fit_states
 from ...segments.segments import Segments
 from ..evidence.effect_selection import SelectionStep
-from ..evidence.evidence import Evidence
+from ..evidence.evidence import Evidence, prior_odds
 from ..evidence.score_test import ScoreTest, solved
 from ..thresholds import THRESHOLDS
+from .coupled_effects import DRAGS
 from .form_families import OWN_TILTS
 from .other_forms import own_form
 from .own_accelerations import OwnAccelerations
 from .rest_tilts import rests_confirm
-from .specific_values import with_specific
+from .specific_values import specific_evidence, values_of_each, with_specific
 
 LIMITS = THRESHOLDS.verdict
 
@@ -164,9 +165,49 @@ def own_tilt_step(
     tilted = replace(world, effects=(*world.effects, ActiveEffect.of(load_effect(names[0]), {}, world.gravity[0, :1])))
     found = refit([flight], tilted, base_parameters(tilted, "flight"))
     mean = {name: found.number(f"{names[0]}.{name}") for name in ("tilt_x", "tilt_y")}
-    evidence = tuple(_evidence(name, std, mean, slow.sway_evidence) for name in names)
+    evidence = [_evidence(name, std, mean, slow.sway_evidence) for name in names]
+    still = _still(found.segments[0])
+    evidence += _own_winds(still, world, names[0], found, candidates, slow.sway_evidence)
     world, flight = _with_own(prepared, found.segments[0], found.world, names[0], std)
-    return SelectionStep(evidence, evidence, True, own_std=std), world, flight
+    return SelectionStep(tuple(evidence), tuple(evidence), True, own_std=std), world, flight
+
+
+def _still(flight: Segments) -> Segments:
+    """Return flights whose noise has no accelerations of their own."""
+    noise = flight.noise_model
+    return replace(flight, noise_model=noise._replace(position=noise.position._replace(sway=0.0)))
+
+
+def _own_winds(
+    flight: Segments, world: World, name: str, tilted: Refit, candidates: Sequence[Candidate], evidence: float
+) -> list[Evidence]:
+    """Return the evidence of a wind of each episode's own, if flights do not tell it from a tilt of each episode's own.
+
+    Through a drag a steady wind pushes across gravity much as a tilt does, and the same in all of an episode's flights.
+
+    Args:
+        flight: Flights with states fitted beside one tilt for all episodes, without accelerations of their own.
+        world: The world without a tilt.
+        name: The tilt.
+        tilted: The fit of one tilt for all episodes.
+        candidates: All candidates.
+        evidence: Twice the gain of the log-likelihood by tilts.
+    """
+    drags = [active.effect for active in world.effects if active.effect.name in DRAGS and not _own(active)]
+    wind = next((one.effect for one in candidates if one.effect.name == "wind"), None)
+    if not drags or wind is None:
+        return []
+    world = without_effects(tilted.world, name)  # with the drag as the fit beside a tilt has it
+    episodes = np.array([item.episode for item in flight.items])
+    start = dict.fromkeys(np.unique(episodes).tolist(), np.zeros(2))
+    flight = fit_states(flight.in_world(world))
+    _, by_tilt = values_of_each(load_effect(name), world, flight, episodes, start)
+    winds, by_wind = values_of_each(wind, world, flight, episodes, start)
+    sizes = [{"w_x": float(x), "w_y": float(y)} for x, y in winds.values()]
+    worse = float(by_wind.sum() - by_tilt.sum()) + sum(prior_odds(wind, own) for own in sizes)
+    if worse > THRESHOLDS.flight.alias_chi2:
+        return []
+    return [specific_evidence("wind@episode", np.array(list(winds.values())), evidence - worse, worse - evidence)]
 
 
 def _with_own(prepared: Prepared, flight: Segments, world: World, name: str, std: float) -> tuple[World, Segments]:
@@ -179,9 +220,7 @@ def _with_own(prepared: Prepared, flight: Segments, world: World, name: str, std
         name: The tilt.
         std: Standard deviation of the tilts between episodes [rad].
     """
-    noise = flight.noise_model
-    still = replace(flight, noise_model=noise._replace(position=noise.position._replace(sway=0.0)))
-    linear = linearize(still, world, (), prepared.groups, robust=False)
+    linear = linearize(_still(flight), world, (), prepared.groups, robust=False)
     numbers = ("tilt_x", "tilt_y")
     columns = linear.columns([f"{name}.{number}" for number in numbers])
     mean = next(active for active in world.effects if active.effect.name == name).values

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ...optimization.tails import chi2_tail
 from ...physics.effects.effect import ActiveEffect, Effect
@@ -15,6 +16,7 @@ from ...physics.effects.registry import load_effect
 from ...physics.parameters import Parameter, effect_parameters
 from ...physics.world import World
 from ...segments.candidates import Candidate
+from ...segments.segment_fit import refit
 from ...segments.segments import Segments
 from ..evidence.evidence import Evidence
 from ..evidence.score_test import ScoreTest
@@ -53,6 +55,35 @@ def with_specific(
         own[episode] = {**own.get(episode, {}), **numbers}
     world = replace(world, effects=(*world.effects, active), own_values=own)
     return world, replace(flight, observations=flight.observations.with_own(world)).in_world(world)
+
+
+def values_of_each(
+    effect: Effect, world: World, flight: Segments, units: NDArray[np.int64], start: Mapping[int, Array]
+) -> tuple[dict[int, Array], Array]:
+    """Return the parameters (k,) of an effect that each unit of flights has, and the chi2 of each flight (B,).
+
+    Args:
+        effect: The effect.
+        world: The world without it.
+        flight: Segments (B) with states fitted by that world.
+        units: Group or episode of each flight (B,).
+        start: Parameters (k,) of each unit to start from.
+    """
+    added = with_neutral(world, effect)
+    own = parameters_of(added, effect.name)
+    values, cost = {}, np.zeros(len(units))
+    for unit, value in start.items():
+        mine = np.flatnonzero(units == unit)
+        fitted = refit([flight.select(mine.tolist())], added, own, encoded(own, value, flight))
+        values[unit] = np.array([fitted.number(parameter.name)[0] for parameter in own])
+        cost[mine] = fitted.by_segment[0].numpy()
+    return values, cost
+
+
+def encoded(parameters: Sequence[Parameter], values: Array, flight: Segments) -> Tensor:
+    """Return values within the bounds of their parameters."""
+    kept = [float(np.clip(value, *p.bounds)) for p, value in zip(parameters, values, strict=True)]
+    return flight.dof.new_tensor(kept).double()
 
 
 def specific_evidence(spec: str, values: Array, statistic: float, delta_bic: float) -> Evidence:

@@ -12,6 +12,7 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose.evidence.effect_selection import _with_unproven, select_next
 from cgwm.pipeline.diagnose.evidence.evidence import Evidence
 from cgwm.pipeline.diagnose.flight import findings as flight_findings
+from cgwm.pipeline.diagnose.flight import own_tilt
 from cgwm.pipeline.diagnose.flight import selection as flight_selection
 from cgwm.pipeline.diagnose.flight.findings import _Search
 from cgwm.pipeline.diagnose.flight.own_accelerations import OwnAccelerations  # pyright: ignore[reportMissingImports]
@@ -23,12 +24,13 @@ from cgwm.pipeline.diagnose.verdict import Findings, _verdict, find
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply
 from cgwm.pipeline.physics.effects import load_effect
 from cgwm.pipeline.physics.world import World
-from cgwm.pipeline.segments.candidates import Candidate
+from cgwm.pipeline.segments.candidates import Candidate, base_parameters
 from cgwm.pipeline.segments.flights.contrasts import moving  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.segments.flights.repeated_forces import RepeatedForce, repeated_force  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.segments.flights.residual_wrench import Omnibus, ResidualWrenches
 from cgwm.pipeline.segments.flights.slow_errors import SlowErrors  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.segments.prepare import Prepared, prepare, whole_flights
+from cgwm.pipeline.segments.segment_fit import refit
 from cgwm.pipeline.trajectories.innovations import FALLS, CorrelatedNoise, NoiseModel, axis_innovations, matern  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.trajectories.segmentation import Segment
 from helpers.diagnosis_data import tosses, world_with
@@ -36,6 +38,7 @@ from helpers.diagnosis_data import tosses, world_with
 LIBRARY = [
     Candidate(name, load_effect(name)) for name in ("linear_drag", "gravity_scale", "gravity_tilt", "frame_tilt")
 ]
+WINDY = [*LIBRARY, Candidate("wind", load_effect("wind"))]
 SLOW_M, SLOW_S, WHITE_M = 7e-4, 0.2, 1e-4
 
 
@@ -52,12 +55,12 @@ def drifting(track: Track, rng: np.random.Generator, tilt_m_s2: float = 0.0) -> 
     return replace(track, position_m=track.position_m + SLOW_M * away + noise + path, quat_wxyz=None)
 
 
-def found(effects: dict, tilt_m_s2: float = 0.0, seed: int = 1) -> Findings:
+def found(effects: dict, tilt_m_s2: float = 0.0, seed: int = 1, library: Sequence[Candidate] = LIBRARY) -> Findings:
     rng = np.random.default_rng(seed)
     flying = tosses(world_with("ball", effects, False), seed, count=8, duration_s=0.8, noise=(1e-9, 1e-8))
     episodes = [(name, {b: drifting(t, rng, tilt_m_s2) for b, t in tracks.items()}) for name, tracks in flying]
     world = world_with("ball", ground=False)
-    return find(prepare(world, episodes), world, LIBRARY)
+    return find(prepare(world, episodes), world, library)
 
 
 @pytest.mark.parametrize("order", FALLS)
@@ -302,8 +305,27 @@ def test_an_effect_that_each_group_has_of_its_own_is_named_for_groups(drags: tup
 
 @pytest.mark.evidence
 def test_a_drag_beside_a_tilt_of_each_episode_is_named() -> None:
-    named = found({"linear_drag": {"c": 0.3}}, tilt_m_s2=0.15, seed=3)
+    named = found({"linear_drag": {"c": 0.3}}, tilt_m_s2=0.15, seed=3, library=WINDY)
     assert [one.evidence.candidate.spec for one in named.chosen] == ["linear_drag", "gravity_tilt@episode"]
+    assert {one.candidate.spec for one in named.chosen[1].equals} == {
+        "gravity_tilt@episode",
+        "frame_tilt@episode",
+        "wind@episode",
+    }
+
+
+@pytest.mark.parametrize(("rate", "told"), [(0.5, 1), (4e-3, 0), (0.0, 0)])
+def test_tilts_of_each_episode_may_be_winds_where_a_drag_carries_them(rate: float, told: int) -> None:
+    """Through a drag of 0.004 / s, tilts of 30 mrad would be winds of 75 m/s, which do not blow in a room."""
+    effects = {"linear_drag": {"c": rate}} if rate else {}
+    world = world_with("ball", effects, False)
+    flying = tosses(world_with("ball", {**effects, "gravity_tilt": {"tilt_x": 0.03}}, False), 2, count=4)
+    prepared = prepare(world, flying)
+    assert prepared.flight is not None
+    tilted = world_with("ball", {**effects, "gravity_tilt": {}}, False)
+    fit = refit([prepared.flight], tilted, base_parameters(tilted, "flight"))
+    winds = own_tilt._own_winds(fit.segments[0], world, "gravity_tilt", fit, WINDY, 40.0)
+    assert [one.candidate.spec for one in winds] == ["wind@episode"] * told
 
 
 def test_a_drag_through_which_a_wind_acts_is_drawn_without_both() -> None:
