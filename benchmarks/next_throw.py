@@ -49,7 +49,7 @@ from diagnose import base_settings
 from hidden_effects import Case, make_capture
 from store import Store, timed
 
-Stage = Literal["development", "report", "report2", "report3", "report4", "report5"]
+Stage = Literal["development", "report", "report2", "report3", "report4", "report5", "report6"]
 """Reports are read once each."""
 Alone = Literal["throws", "slides", "drops", "rolls"]
 

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from .hull import Hull
+from .kept import Kept
 from .patch import Patch
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body:
+class Body(Kept):
     """A rigid body made of spheres; every tensor has a batch dimension of 1 or B."""
 
     name: str

@@ -12,6 +12,7 @@ from torch import Tensor
 from ...schemas import InputDataError, UsageError
 from ...schemas.materials import of_pair
 from ..geometry.rotation import quat_to_matrix
+from .body import Body
 from .chains.state import require_chains
 from .contact_detection import GROUND, Placed, body_points, near_body, pairs_of, plain
 from .contact_law import ContactLaw
@@ -19,7 +20,7 @@ from .pair_laws import laws_in_use
 from .paper_law import PaperLaw, stable_step
 from .state import State
 from .surfaces.detection import surface_depth
-from .world import World
+from .world import World, called
 
 DEEPEST_SHARE = 0.25
 """Maximum initial overlap as a share of the smaller radius; from deeper overlaps contact would throw bodies apart."""
@@ -33,29 +34,10 @@ def require_physical(world: World) -> None:
     Raises:
         InputDataError: If one cannot, with the body or coefficient, its value and the environment.
     """
+    check = _BodyCheck(world.source)
     for body in world.bodies:
-        if not body.free:
-            continue
-        place = world.called(f"body '{body.name}'")
-        _require(plain(body.mass) > 0, plain(body.mass), f"{place}: mass", "kg", "above 0 kg")
-        _require(
-            torch.isfinite(plain(body.inertia)).flatten(1).all(-1),
-            plain(body.inertia).flatten(1).sum(-1),
-            f"{place}: the sum of its inertia",
-            "kg m2",
-            "finite",
-        )
-        moments = torch.linalg.eigvalsh(plain(body.inertia))
-        _require(moments[..., 0] > 0, moments[..., 0], f"{place}: smallest moment of inertia", "kg m2", "above 0")
-        excess = moments[..., 2] - moments[..., 0] - moments[..., 1]
-        _require(
-            excess <= TRIANGLE_TOLERANCE * moments[..., 2],
-            moments[..., 2],
-            f"{place}: largest moment of inertia",
-            "kg m2",
-            "at most the sum of the two smaller ones: no distribution of mass has more",
-        )
-        _require((plain(body.radii) > 0).all(-1), plain(body.radii).amin(-1), f"{place}: radius", "m", "above 0")
+        if body.free:
+            body.once(check)
     require_chains(world)
     if world.pair_laws and not isinstance(world.contact, ContactLaw):
         raise UsageError(
@@ -73,6 +55,32 @@ def require_physical(world: World) -> None:
             f"a step above 0 and up to {1e3 * bound:.3g} ms.",
             "take a smaller step (--set phys-geo.step_s=...), or a softer contact.",
         )
+
+
+@dataclass(frozen=True)
+class _BodyCheck:
+    """Checks that mass, inertia and radii of a body can be simulated; messages name the file that they come from."""
+
+    source: str
+    """As `World.source`."""
+
+    def __call__(self, body: Body) -> None:
+        place = called(self.source, f"body '{body.name}'")
+        mass, inertia, radii = plain(body.mass), plain(body.inertia), plain(body.radii)
+        _require(mass > 0, mass, f"{place}: mass", "kg", "above 0 kg")
+        finite = torch.isfinite(inertia).flatten(1).all(-1)
+        _require(finite, inertia.flatten(1).sum(-1), f"{place}: the sum of its inertia", "kg m2", "finite")
+        moments = torch.linalg.eigvalsh(inertia)
+        _require(moments[..., 0] > 0, moments[..., 0], f"{place}: smallest moment of inertia", "kg m2", "above 0")
+        excess = moments[..., 2] - moments[..., 0] - moments[..., 1]
+        _require(
+            excess <= TRIANGLE_TOLERANCE * moments[..., 2],
+            moments[..., 2],
+            f"{place}: largest moment of inertia",
+            "kg m2",
+            "at most the sum of the two smaller ones: no distribution of mass has more",
+        )
+        _require((radii > 0).all(-1), radii.amin(-1), f"{place}: radius", "m", "above 0")
 
 
 def _require_law(world: World, pair: tuple[str, str] | None, law: ContactLaw | PaperLaw) -> None:

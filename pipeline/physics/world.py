@@ -18,6 +18,7 @@ from .body import Body
 from .chains.chain import Chain
 from .contact_law import ContactLaw
 from .effects.effect import ActiveEffect
+from .kept import Kept
 from .paper_law import PaperLaw
 from .state import State
 from .surfaces.fixed_surface import FixedSurface
@@ -28,8 +29,13 @@ MOST_STEPS = 2_000_000_000
 """Maximum number of steps of a rollout: some hours; the kernels count them in 32 bits."""
 
 
+def called(source: str, what: str) -> str:
+    """Return what messages call a part of a world that was built from a file, or from none: ""."""
+    return f"{source}: {what}" if source else what
+
+
 @dataclass(frozen=True, kw_only=True)
-class World:
+class World(Kept):
     """The bodies of a scene, the ground, gravity, the contact law and the effects."""
 
     bodies: tuple[Body, ...]
@@ -69,14 +75,7 @@ class World:
 
     def called(self, what: str) -> str:
         """Return what messages call a part of the world: with the file that it comes from."""
-        return f"{self.source}: {what}" if self.source else what
-
-    def once(self, make: Callable[[World], T]) -> T:
-        """Return `make(self)`, made at the first call and kept with the world; for what depends on nothing else."""
-        kept: dict[object, object] = self.__dict__.setdefault("_kept", {})
-        if make not in kept:
-            kept[make] = make(self)
-        return cast(T, kept[make])
+        return called(self.source, what)
 
     def latest(self, make: Callable[..., T], *inputs: State | Tensor) -> T:
         """Return `make(self, *inputs)`, kept with the world until it is asked for with other objects.

@@ -299,10 +299,7 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
     others = None if all(free for free, _ in groups) else _other_columns(world, state, turn)
     for free, rows in groups:
         if free or others is None:
-            weights = world.once(_weights)
-            columns += [
-                x for index in rows for x in _free_columns(world.bodies[index], weights[index], index, state, turn)
-            ]
+            columns += [x for index in rows for x in _free_columns(world.bodies[index], index, state, turn)]
         else:
             columns.append(others[:, rows[0] : rows[-1] + 1].flatten(1))
     return columns
@@ -314,23 +311,19 @@ def _groups(world: World) -> list[tuple[bool, list[int]]]:
     return [(kind, [*rows]) for kind, rows in groupby(range(len(free)), free.__getitem__)]
 
 
-def _free_columns(body: Body, weight: list[Tensor], index: int, state: State, turn: Tensor | None) -> list[Tensor]:
+def _free_columns(body: Body, index: int, state: State, turn: Tensor | None) -> list[Tensor]:
     """Return the columns of a free body: those of its weight, and its motion."""
     motion = start(body, *(part[:, index] for part in state.tensors))
     moving = (in_frame(turn, x) for x in (motion.velocity, motion.spin))
     pose = in_frame(turn, motion.com), quat_in_frame(turn, motion.quat_wxyz)
-    return [*weight, *pose, *moving]
+    return [*body.once(_weight), *pose, *moving]
 
 
-def _weights(world: World) -> dict[int, list[Tensor]]:
-    """Return by free body the columns of its inverse mass and inertia and its centre of mass."""
-    found = {}
-    for index, body in enumerate(world.bodies):
-        if body.free:
-            inverse = torch.linalg.inv(body.inertia).flatten(1)
-            inertia = torch.cat([inverse[:, k : k + 1] for k in (0, 4, 8, 1, 2, 5)], -1)
-            found[index] = [body.mass.reciprocal()[:, None], inertia, body.com]
-    return found
+def _weight(body: Body) -> list[Tensor]:
+    """Return the columns of a body's inverse mass and inertia and its centre of mass."""
+    inverse = torch.linalg.inv(body.inertia).flatten(1)
+    inertia = torch.cat([inverse[:, k : k + 1] for k in (0, 4, 8, 1, 2, 5)], -1)
+    return [body.mass.reciprocal()[:, None], inertia, body.com]
 
 
 def _other_columns(world: World, state: State, turn: Tensor | None) -> Tensor:

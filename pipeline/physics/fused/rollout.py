@@ -111,9 +111,10 @@ def roll(
     require_one_kind(world.gravity, *state.tensors, times_s)
     world.once(require_physical)
     require_state(state, world.body_names)
-    world = changed_by_effects(world)
-    if world.effects:
-        require_physical(world)  # an effect may give a body an impossible inertia
+    changed = changed_by_effects(world)
+    if changed is not world:
+        require_physical(changed)  # an effect may give a body an impossible inertia
+    world = changed
     packed = pack(world, state, times_s, driven or {}, record_contacts)
     values, tangents = _values_and_tangents(packed.table, packed.steps, packed.geometry, packed.surfaces, packed.drives)
     dual = any(tangent is not None for tangent in tangents)
