@@ -19,6 +19,7 @@ import numpy as np
 from ...schemas import InputDataError
 from ...schemas.documents import parse_json
 from ..io.hdf5_files import hdf5_faults, open_hdf5, own_objects, require_stored
+from .guarded_file import written_hdf5
 from .rollouts import Node
 
 RUNS_FORMAT = "cgwm-runs/1"
@@ -115,7 +116,7 @@ class RunTables:
 
 def write_runs(path: Path, runs: Sequence[RunTables], task_toml: str, creator: str) -> None:
     """Write runs; pass the temporary path of :func:`datasets.io.atomic.new_directory`."""
-    with h5py.File(path, "w", track_order=False) as file:
+    with written_hdf5(path) as file:
         file.attrs.update({"format": RUNS_FORMAT, "creator": creator, "task_toml": task_toml, "convention": CONVENTION})
         data = file.create_group("data")
         data.attrs["env_args"] = json.dumps({"env_name": "cgwm", "env_type": 2, "type": 2, "env_kwargs": {}})

@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import h5py
 
 
 class GuardedFile(io.RawIOBase):
@@ -73,3 +77,20 @@ class GuardedFile(io.RawIOBase):
         if not self.closed:
             os.close(self._descriptor)
         super().close()
+
+
+@contextmanager
+def written_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Write an HDF5 file; pass a temporary path.
+
+    Raises:
+        OSError: If the file cannot be written, as on a full disk.
+    """
+    guarded = GuardedFile(path)
+    try:
+        with h5py.File(guarded, "w", track_order=False) as file:
+            yield file
+    finally:
+        guarded.close()
+        if guarded.error is not None:
+            raise guarded.error

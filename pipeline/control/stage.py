@@ -137,10 +137,19 @@ def control(
         device=resolve_device(device).type,
     )
     made_of = {**request.inputs(), **request.settings, "versions": json.dumps(versions())}
-    if finished and resume and (kept := _kept(out, request)) is not None:
-        note(f"control: {out} is already the result of this command")
-        Checkpoint.remove_of(out, made_of)  # which a process left that was killed at its very end
-        return kept
+    if finished and resume:
+        kept = read_json(out / DOCUMENT, ControlResult)
+        others = _others(kept, request)
+        if not others:
+            note(f"control: {out} is already the result of this command")
+            Checkpoint.remove_of(out, made_of)  # which a process left that was killed at its very end
+            return kept
+        if not overwrite:
+            raise UsageError(
+                f"{out} was made with other {', '.join(others)}.",
+                "the same command, with --resume.",
+                "pass what was passed before, choose another name for the output, or pass --overwrite.",
+            )
     refuse_output(out, "run", overwrite)
     planning = planning_world(request.model, request.task)
     with control_budget(planning, _briefly(request.task), 1, draws, out):  # faults are told before long work
@@ -166,11 +175,13 @@ def _briefly(task: AnyTask) -> AnyTask:
     return task.model_copy(update=brief)
 
 
-def _kept(out: Path, request: _Request) -> ControlResult | None:
-    """Return the result of a complete run if it is made of the same; None if it is not."""
-    found = read_json(out / DOCUMENT, ControlResult)
-    same = found.settings == request.settings and found.input_sha256 == request.inputs()
-    return found if same and found.versions == versions() else None
+def _others(found: ControlResult, request: _Request) -> list[str]:
+    """Return the names of what a run was made of that is not what is asked for."""
+    pairs = [(found.settings, request.settings), (found.input_sha256, request.inputs())]
+    names = [
+        name for before, now in pairs for name in dict.fromkeys((*now, *before)) if before.get(name) != now.get(name)
+    ]
+    return names + ([] if found.versions == versions() else ["version of cgwm or a library"])
 
 
 def _require_speed(runner: Runner, task: AnyTask) -> None:
@@ -246,7 +257,6 @@ def _result(
     good = [one for one in figures if one.ended == "success"]
     taken = float(np.median([one.plan_ms for one in figures])) / 1e3
     late = sum(one.late_plans for one in figures)
-    warnings = [f"predictions run in the slow engine: {runner.controller.slow}."] if runner.controller.slow else []
     return ControlResult(
         model=names[0],
         task=names[1],
@@ -273,5 +283,19 @@ def _result(
         input_sha256=request.inputs(),
         settings=request.settings,
         versions=versions(),
-        warnings=tuple(warnings),
+        warnings=warnings_of(runner.controller.slow, request.draws, request.model),
     )
+
+
+def warnings_of(slow: str, draws: int, model: Model) -> tuple[str, ...]:
+    """Return what a run should be told of.
+
+    Args:
+        slow: Why predictions run in the slow engine; empty where they do not.
+        draws: Draws of the model for each plan.
+        model: The model.
+    """
+    found = [f"predictions run in the slow engine: {slow}."] if slow else []
+    if draws and not any(parameter.std_error for parameter in model.file.parameters):
+        found.append(f"--draws {draws}: the model has no standard errors, so that all draws are its estimate.")
+    return tuple(found)

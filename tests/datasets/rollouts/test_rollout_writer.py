@@ -11,8 +11,9 @@ import hdf5plugin
 import numpy as np
 import pytest
 from cgwm.datasets.io.atomic import sha256
-from cgwm.datasets.rollouts import rollout_demo, rollout_writer
+from cgwm.datasets.rollouts import guarded_file, rollout_demo, rollout_writer
 from cgwm.datasets.rollouts.chunks import chunked, encoded, image_of, jpeg_of
+from cgwm.datasets.rollouts.guarded_file import written_hdf5
 from cgwm.datasets.rollouts.loader import RolloutReader
 from cgwm.datasets.rollouts.rollout_writer import RolloutWriter
 from cgwm.datasets.rollouts.rollouts import amodal_dtype
@@ -94,6 +95,18 @@ except NotEnoughSpaceError as error:
     first, todo = done.stdout.splitlines()
     assert f"{tmp_path}: after " in first and "full: File too large." in first
     assert todo.startswith("Next: free some")
+
+
+def test_an_hdf5_file_that_does_not_fit_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a file that h5py opens by its name, this process would crash at its exit."""
+
+    def full(descriptor: int, data: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(guarded_file.os, "write", full)
+    with pytest.raises(OSError, match="No space left"), written_hdf5(tmp_path / "a.h5") as file:
+        file.create_dataset("x", data=np.zeros(100_000))
+    assert not file.id.valid
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])

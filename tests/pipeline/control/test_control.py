@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -91,6 +92,8 @@ def test_a_killed_run_goes_on_where_it_was(done: Path, inputs: tuple[Path, Path]
     assert not (out.parent / "again.checkpoint").exists()
     stage.control(*inputs, out, clock="ideal", seeds=2, resume=True)  # complete: kept
     assert seeds == [1]
+    with pytest.raises(UsageError, match=r"again was made with other solver, seeds"):
+        stage.control(*inputs, out, solver="both", clock="ideal", seeds=3, resume=True)
 
 
 @pytest.mark.parametrize(
@@ -141,6 +144,13 @@ def test_numbers_out_of_range_are_refused(inputs: tuple[Path, Path], tmp_path: P
         stage.control(*inputs, tmp_path / "run", seeds=0)
     with pytest.raises(UsageError, match="--draws -1"):
         stage.control(*inputs, tmp_path / "run", draws=-1)
+
+
+def test_draws_of_a_model_without_standard_errors_are_told() -> None:
+    unsure = pushed_model(visible=False)
+    parameters = tuple(one.model_copy(update={"std_error": None}) for one in unsure.file.parameters)
+    sure = replace(unsure, file=unsure.file.model_copy(update={"parameters": parameters}))
+    assert [len(stage.warnings_of("", draws, model)) for draws in (0, 4) for model in (unsure, sure)] == [0, 0, 0, 1]
 
 
 def test_advice_and_intervals() -> None:
