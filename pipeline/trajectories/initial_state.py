@@ -36,26 +36,37 @@ def clearance(world: World, observations: Observations) -> Tensor:
     for column, index in enumerate(observations.free):
         body = world.bodies[index]
         rotation = quat_to_matrix(observations.quat_wxyz[:, :, column])
-        centers = observations.position_m[:, :, column, None] + body.centers[0] @ rotation.transpose(-1, -2)
+        position = observations.position_m[:, :, column]
         if world.ground_normal is not None and world.ground_offset is not None:
-            gaps.append((centers @ world.ground_normal - world.ground_offset[0] - body.radii[0]).amin(-1))
-        for name, drive in observations.drives.items():
-            other = next(body for body in world.bodies if body.name == name)
-            columns = []
-            for frame in range(observations.times_s.shape[1]):
-                pose = drive.at(observations.times_s[:, frame])
-                points = pose.com[:, None] + other.centers[0] @ quat_to_matrix(pose.quat_wxyz).transpose(-1, -2)
-                distance, _ = union_distance(points, centers[:, frame], body.radii.expand(len(points), -1), width=1e-3)
-                columns.append((distance - other.radii).amin(-1))
-            gaps.append(torch.stack(columns, 1))
-        for other in world.bodies:
-            if other.motion == "fixed" and other.place is not None:
-                gaps.append(_gap_to_fixed(other, centers, body.radii))
+            chosen = slice(None) if body.on_plane is None else body.on_plane
+            along = (rotation.transpose(-1, -2) @ world.ground_normal) @ body.centers[0, chosen].T
+            height = position @ world.ground_normal - world.ground_offset[0]
+            gaps.append(height + (along - body.radii[0, chosen]).amin(-1))
+        if observations.drives or any(other.motion == "fixed" for other in world.bodies):
+            gaps += _gaps_to_bodies(world, observations, body, position[:, :, None] + body.centers[0] @ rotation.mT)
         if world.surfaces and body.radii.shape[-1]:
-            gaps.append(_gap_to_surfaces(world, body, observations.position_m[:, :, column], rotation))
+            gaps.append(_gap_to_surfaces(world, body, position, rotation))
     if not gaps:
         return torch.full_like(observations.times_s, torch.inf)
     return torch.stack(gaps).amin(0)
+
+
+def _gaps_to_bodies(world: World, observations: Observations, body: Body, centers: Tensor) -> list[Tensor]:
+    """Return the gaps (B, T) [m] of a body, its spheres at `centers` (B, T, N, 3), to each driven and fixed body."""
+    gaps = []
+    for name, drive in observations.drives.items():
+        other = next(body for body in world.bodies if body.name == name)
+        columns = []
+        for frame in range(observations.times_s.shape[1]):
+            pose = drive.at(observations.times_s[:, frame])
+            points = pose.com[:, None] + other.centers[0] @ quat_to_matrix(pose.quat_wxyz).transpose(-1, -2)
+            distance, _ = union_distance(points, centers[:, frame], body.radii.expand(len(points), -1), width=1e-3)
+            columns.append((distance - other.radii).amin(-1))
+        gaps.append(torch.stack(columns, 1))
+    for other in world.bodies:
+        if other.motion == "fixed" and other.place is not None:
+            gaps.append(_gap_to_fixed(other, centers, body.radii))
+    return gaps
 
 
 def _gap_to_fixed(other: Body, centers: Tensor, radii: Tensor) -> Tensor:

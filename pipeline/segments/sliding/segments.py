@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -50,20 +51,63 @@ def find_sliding_segments(world: World, whole: Observations, clear: Tensor, nois
     margin = LIMITS.near_m + LIMITS.near_sigmas * float(np.hypot(noise.position_m, noise.rotation_rad * size_of(body)))
     lowest = heights_of(world, body, whole, 0).amin(-1)
     on = (lowest < margin) & ~clear & (whole.seen[:, :, 0] > 0)
-    found = []
-    for episode, times in enumerate(whole.times_s):
-        seen = (whole.seen[episode].amax(-1) > 0).nonzero()[:, 0]  # any frame may be hidden, the first included
-        if len(seen) < 2:
-            continue
-        near = on[episode, seen].numpy()
-        if not near.any():
-            continue
-        steady = near & ~_impacts(world, whole, episode, seen, noise, near)
-        if not is_round(body):
-            steady &= ~_tilting(world, whole, episode, seen, noise.rotation_rad, near)
-        parts = _parts(times[seen].numpy(), steady)
-        found += [Segment(episode, int(seen[first]), int(seen[last])) for first, last in parts]
+    track = _SeenFrames.of(whole, on)
+    near = on.flatten()[track.rows].numpy()
+    steady = near & ~_impacts(world, whole, track, noise, near)
+    if not is_round(body):
+        steady &= ~_tilting(world, whole, track, noise.rotation_rad, near)
+    found, length = [], whole.times_s.shape[1]
+    for own in track.episodes:
+        parts = _parts(track.times[own], steady[own])
+        rows = track.rows[own].tolist()
+        found += [Segment(rows[0] // length, rows[first] % length, rows[last] % length) for first, last in parts]
     return without_rest(whole, found, noise)
+
+
+@dataclass(frozen=True)
+class _SeenFrames:
+    """Seen frames (N) of the episodes of which a frame is asked for, one episode after another."""
+
+    rows: Tensor
+    """Their places among all frames of all episodes, shape (N,)."""
+    times: Array
+    """Their times, shape (N,) [s]."""
+    episodes: list[slice]
+    """Where each episode's frames are, two or more."""
+
+    @staticmethod
+    def of(whole: Observations, asked: Tensor) -> _SeenFrames:
+        """Return them, of frames (E, T) that are asked for."""
+        seen = whole.seen.amax(-1) > 0  # any frame may be hidden, the first included
+        seen &= ((asked & seen).any(1) & (seen.sum(1) > 1))[:, None]
+        rows = seen.flatten().nonzero()[:, 0]
+        ends = [0, *itertools.accumulate(count for count in seen.sum(1).tolist() if count)]
+        return _SeenFrames(rows, whole.times_s.flatten()[rows].numpy(), [slice(*ab) for ab in itertools.pairwise(ends)])
+
+    def beside(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the chosen frames (N,) and those next to one in an episode."""
+        wide = chosen.copy()
+        for own in self.episodes:
+            wide[own][1:] |= chosen[own][:-1]
+            wide[own][:-1] |= chosen[own][1:]
+        return wide
+
+    def windows(self, asked: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
+        """Yield asked frames (n,), those within some steps of each (n, w), and their distance (n, w) [s].
+
+        Frames with as many others near them come together.
+        """
+        firsts, ends = np.zeros((2, len(self.times)), np.int64)
+        for own in self.episodes:
+            times = self.times[own]
+            step = float(np.median(np.diff(times)))
+            reach = (max(SIDE_FRAMES, round(SIDE_S / step)) + 0.5) * step
+            firsts[own] = own.start + np.searchsorted(times, times - reach)
+            ends[own] = own.start + np.searchsorted(times, times + reach)
+        for width in np.unique((ends - firsts)[asked]).tolist():
+            places = np.flatnonzero((ends - firsts == width) & asked)
+            frames = firsts[places, None] + np.arange(width)
+            yield places, frames, self.times[frames] - self.times[places, None]
 
 
 def grounded_states(segments: Segments, state: State) -> State:
@@ -89,24 +133,23 @@ def grounded_states(segments: Segments, state: State) -> State:
 
 
 def _impacts(
-    world: World, whole: Observations, episode: int, seen: Tensor, noise: Noise, asked: NDArray[np.bool_]
+    world: World, whole: Observations, track: _SeenFrames, noise: Noise, asked: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Return which of the asked frames are within one frame of a jump of the speed along the normal, or of the tilting.
 
     Args:
         world: For shape and ground.
         whole: The episodes.
-        episode: Index of the episode.
-        seen: Indices of its seen frames.
+        track: Their seen frames (N).
         noise: Standard deviations of the tracks.
-        asked: Which of the seen frames are asked for; the answer for others means nothing.
+        asked: Which of these are asked for, shape (N,); the answer for others means nothing.
     """
     body, normal = world.bodies[whole.free[0]], GroundPlane.of(world).normal
-    height = (whole.position_m[episode, seen, 0] @ normal).numpy()
-    quat, turned = whole.quat_wxyz[episode, seen, 0], whole.has_orientation[episode, seen, 0].numpy() > 0
+    height = (whole.position_m[:, :, 0].flatten(0, 1)[track.rows] @ normal).numpy()
+    quat, turned = whole.quat_wxyz[:, :, 0].flatten(0, 1)[track.rows], _turned(whole, track)
     level = tangent_axes(normal)[1:]
-    jumps = np.zeros(len(seen), np.bool_)
-    for places, frames, t in _windows(whole.times_s[episode, seen].numpy(), _beside(asked)):
+    jumps = np.zeros(len(track.times), np.bool_)
+    for places, frames, t in track.windows(track.beside(asked)):
         inverse = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2, np.maximum(t, 0.0)], -1))[:, 3]
         spread = np.linalg.norm(inverse, axis=1)
         least = np.maximum(LIMITS.jump_m_s, LIMITS.jump_sigmas * noise.position_m * spread)
@@ -119,26 +162,23 @@ def _impacts(
             least = np.maximum(LIMITS.jump_m_s / size_of(body), LIMITS.jump_sigmas * noise.rotation_rad * spread)
             found |= known & (tilting > least)
         jumps[places] = found & ((t < 0).sum(1) >= 2) & ((t > 0).sum(1) >= 2)
-    return _beside(jumps)
+    return track.beside(jumps)
 
 
-def _beside(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the chosen frames and those next to one."""
-    wide = chosen.copy()
-    wide[1:] |= chosen[:-1]
-    wide[:-1] |= chosen[1:]
-    return wide
+def _turned(whole: Observations, track: _SeenFrames) -> NDArray[np.bool_]:
+    """Return at which of the seen frames (N,) the orientation was measured."""
+    return (whole.has_orientation[:, :, 0].flatten()[track.rows] > 0).numpy()
 
 
 def _tilting(
-    world: World, whole: Observations, episode: int, seen: Tensor, noise_rad: float, asked: NDArray[np.bool_]
+    world: World, whole: Observations, track: _SeenFrames, noise_rad: float, asked: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Return at which of the asked frames the body does not stay on one of its sides; arguments as of `_impacts`."""
-    normal = GroundPlane.of(world).normal
-    turned = whole.has_orientation[episode, seen, 0].numpy() > 0
-    up = (quat_to_matrix(whole.quat_wxyz[episode, seen, 0]).transpose(-1, -2) @ normal).numpy()
-    tilts = np.zeros(len(seen), np.bool_)
-    for places, frames, t in _windows(whole.times_s[episode, seen].numpy(), asked):
+    normal, turned = GroundPlane.of(world).normal, _turned(whole, track)
+    quat = whole.quat_wxyz[:, :, 0].flatten(0, 1)[track.rows]
+    up = (quat_to_matrix(quat).transpose(-1, -2) @ normal).numpy()
+    tilts = np.zeros(len(track.times), np.bool_)
+    for places, frames, t in track.windows(asked):
         known = turned[frames]
         # a frame that does not count is a row of zeros
         slope = np.linalg.pinv(np.stack([np.ones_like(t), t], -1) * known[..., None])[:, 1]
@@ -146,25 +186,6 @@ def _tilting(
         tilting = np.linalg.norm(np.einsum("nw,nwa->na", slope, up[frames]), axis=1)
         tilts[places] = (known.sum(1) >= 3) & (tilting > least)
     return tilts
-
-
-def _windows(times: Array, asked: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
-    """Yield asked frames (n,), those within some steps of each (n, w), and their distance (n, w) [s].
-
-    Frames with as many others near them come together.
-
-    Args:
-        times: Of the frames, at least two [s].
-        asked: Which of them are asked for.
-    """
-    step = float(np.median(np.diff(times)))
-    side = max(SIDE_FRAMES, round(SIDE_S / step))
-    reach = (side + 0.5) * step
-    firsts, ends = np.searchsorted(times, times - reach), np.searchsorted(times, times + reach)
-    for width in np.unique((ends - firsts)[asked]).tolist():
-        places = np.flatnonzero((ends - firsts == width) & asked)
-        frames = firsts[places, None] + np.arange(width)
-        yield places, frames, times[frames] - times[places, None]
 
 
 def _parts(times: Array, steady: NDArray[np.bool_]) -> list[tuple[int, int]]:

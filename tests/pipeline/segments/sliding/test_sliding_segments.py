@@ -17,8 +17,8 @@ from cgwm.pipeline.segments.sliding.segments import (
     SIDE_S,
     _impacts,
     _parts,
+    _SeenFrames,
     _tilting,
-    _windows,
     find_sliding_segments,
     grounded_states,
 )
@@ -31,6 +31,7 @@ RATE_HZ, HALF_M = 100.0, 0.03
 NOISE = Noise(1e-5, 1e-5)
 TIMES = np.arange(60) / RATE_HZ
 ALL = np.ones(60, bool)
+SEEN = _SeenFrames(torch.arange(60), TIMES, [slice(0, 60)])
 BOX, BALL = world_of(box_body()), world_of(ball_body(HALF_M))
 
 
@@ -44,8 +45,8 @@ def measured(world: World, height_m: np.ndarray, turn: np.ndarray | None = None)
 def test_windows_reach_equally_far_on_both_sides() -> None:
     times = np.delete(TIMES, [20, 21])
     side = max(SIDE_FRAMES, round(SIDE_S * RATE_HZ))
-    seen = []
-    for places, frames, t in _windows(times, ALL[:58]):
+    track, seen = _SeenFrames(torch.arange(58), times, [slice(0, 58)]), []
+    for places, frames, t in track.windows(ALL[:58]):
         for place, window, away in zip(places.tolist(), frames.tolist(), t, strict=True):
             seen.append(place)
             near = np.flatnonzero(np.abs(times - times[place]) < (side + 0.5) / RATE_HZ)
@@ -53,53 +54,61 @@ def test_windows_reach_equally_far_on_both_sides() -> None:
             np.testing.assert_allclose(away, times[near] - times[place])
     assert sorted(seen) == list(range(len(times)))
     slow = np.arange(20) * 0.05  # at least three frames on each side, however slow
-    assert max(frames.shape[1] for _, frames, _ in _windows(slow, ALL[:20])) == 2 * SIDE_FRAMES + 1
+    track = _SeenFrames(torch.arange(20), slow, [slice(0, 20)])
+    assert max(frames.shape[1] for _, frames, _ in track.windows(ALL[:20])) == 2 * SIDE_FRAMES + 1
+    both = _SeenFrames(torch.arange(80), np.append(TIMES, slow), [slice(0, 60), slice(60, 80)])  # each by itself
+    found = dict(
+        pair for places, frames, _ in both.windows(np.ones(80, bool)) for pair in zip(places, frames, strict=True)
+    )
+    assert found[59].tolist() == [55, 56, 57, 58, 59]
+    assert found[60].tolist() == [60, 61, 62, 63]
+    chosen = np.zeros(80, bool)
+    chosen[[59, 70]] = True
+    assert np.flatnonzero(both.beside(chosen)).tolist() == [58, 59, 69, 70, 71]
 
 
 @pytest.mark.parametrize(("world", "share", "found"), [(BALL, 1.05, True), (BALL, 0.95, False), (BOX, 1.05, True)])
 def test_a_jump_of_the_speed_is_an_impact_with_the_frames_beside_it(world: World, share: float, found: bool) -> None:
     kink = share * LIMITS.jump_m_s * np.maximum(TIMES - TIMES[30], 0.0)
     whole = measured(world, kink + 2 * TIMES**2)
-    at = np.flatnonzero(_impacts(world, whole, 0, torch.arange(len(TIMES)), NOISE, ALL))
+    at = np.flatnonzero(_impacts(world, whole, SEEN, NOISE, ALL))
     assert (at.tolist() == [29, 30, 31]) if found else (len(at) == 0)
     asked = ALL & (np.arange(60) < 30)  # only the frame before the jump knows of it
-    at = np.flatnonzero(_impacts(world, whole, 0, torch.arange(len(TIMES)), NOISE, asked)[:30])
+    at = np.flatnonzero(_impacts(world, whole, SEEN, NOISE, asked)[:30])
     assert at.tolist() == [29] * found
     noisy = Noise(share * NOISE.position_m * 1e3, NOISE.rotation_rad)  # what noise may do is none
-    assert not _impacts(world, whole, 0, torch.arange(len(TIMES)), noisy, ALL).any()
+    assert not _impacts(world, whole, SEEN, noisy, ALL).any()
     edge = measured(world, 9 * LIMITS.jump_m_s * np.maximum(TIMES - TIMES[1], 0.0))
-    assert not _impacts(world, edge, 0, torch.arange(len(TIMES)), NOISE, ALL)[:1].any()
+    assert not _impacts(world, edge, SEEN, NOISE, ALL)[:1].any()
 
 
 @pytest.mark.parametrize(("share", "found"), [(1.05, True), (0.95, False)])
 def test_a_jump_of_the_tilting_is_an_impact_of_a_body_with_edges(share: float, found: bool) -> None:
     rate = share * LIMITS.jump_m_s / size_of(BOX.bodies[0])
     tilt = np.outer(rate * np.maximum(TIMES - TIMES[30], 0.0), [0.6, 0.8, 0.0])
-    every = torch.arange(len(TIMES))
-    at = np.flatnonzero(_impacts(BOX, measured(BOX, 0 * TIMES, tilt), 0, every, NOISE, ALL))
+    at = np.flatnonzero(_impacts(BOX, measured(BOX, 0 * TIMES, tilt), SEEN, NOISE, ALL))
     assert (at.tolist() == [29, 30, 31]) if found else (len(at) == 0)
     spin = np.outer(5 * rate * np.maximum(TIMES - TIMES[30], 0.0), [0.0, 0.0, 1.0])
-    assert not _impacts(BOX, measured(BOX, 0 * TIMES, spin), 0, every, NOISE, ALL).any()
-    assert not _impacts(BALL, measured(BALL, 0 * TIMES, 5 * tilt), 0, every, NOISE, ALL).any()
+    assert not _impacts(BOX, measured(BOX, 0 * TIMES, spin), SEEN, NOISE, ALL).any()
+    assert not _impacts(BALL, measured(BALL, 0 * TIMES, 5 * tilt), SEEN, NOISE, ALL).any()
     unknown = measured(BOX, 0 * TIMES, tilt)
     unknown = replace(unknown, has_orientation=0 * unknown.has_orientation)
-    assert not _impacts(BOX, unknown, 0, every, NOISE, ALL).any()
+    assert not _impacts(BOX, unknown, SEEN, NOISE, ALL).any()
 
 
 @pytest.mark.parametrize(("share", "found"), [(1.03, True), (0.97, False)])
 def test_a_body_that_tilts_turns_over_an_edge(share: float, found: bool) -> None:
-    every = torch.arange(len(TIMES))
     tilt = np.outer(share * LIMITS.tilting_rad_s * TIMES, [0.6, 0.8, 0.0])
-    assert _tilting(BOX, measured(BOX, 0 * TIMES, tilt), 0, every, NOISE.rotation_rad, ALL).all() == found
+    assert _tilting(BOX, measured(BOX, 0 * TIMES, tilt), SEEN, NOISE.rotation_rad, ALL).all() == found
     spin = np.outer(9 * TIMES, [0.0, 0.0, 1.0])
-    assert not _tilting(BOX, measured(BOX, 0 * TIMES, spin), 0, every, NOISE.rotation_rad, ALL).any()
-    assert not _tilting(BOX, measured(BOX, 0 * TIMES, tilt), 0, every, 0.05, ALL).any()
+    assert not _tilting(BOX, measured(BOX, 0 * TIMES, spin), SEEN, NOISE.rotation_rad, ALL).any()
+    assert not _tilting(BOX, measured(BOX, 0 * TIMES, tilt), SEEN, 0.05, ALL).any()
     few = measured(BOX, 0 * TIMES, tilt)
     marks = torch.zeros_like(few.has_orientation)
     marks[:, ::6] = 1  # at most two in a window
-    assert not _tilting(BOX, replace(few, has_orientation=marks), 0, every, NOISE.rotation_rad, ALL).any()
+    assert not _tilting(BOX, replace(few, has_orientation=marks), SEEN, NOISE.rotation_rad, ALL).any()
     marks[:, ::3] = 1
-    some = _tilting(BOX, replace(few, has_orientation=marks), 0, every, NOISE.rotation_rad, ALL)
+    some = _tilting(BOX, replace(few, has_orientation=marks), SEEN, NOISE.rotation_rad, ALL)
     assert bool(some[8:-8].any()) == found
 
 
