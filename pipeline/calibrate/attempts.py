@@ -24,6 +24,7 @@ from .focal_prior import EXIF_STD, FocalLength, focal_lengths
 from .mapping import (
     Mapped,
     adjusted,
+    adjusts_without_blas,
     map_database,
     triangulated,
     with_focal_lengths,
@@ -219,7 +220,8 @@ def _supported(mapped: Mapped, start: str, inputs: Inputs, seed: int) -> tuple[M
     """
     tried = richer(start, "SIMPLE_PINHOLE" if _all_known(inputs) else "OPENCV")
     mapped = _with_principal_points(mapped, start, inputs, seed)
-    with ThreadPoolExecutor(min(processors(), len(tried))) as pool:  # COLMAP adjusts each in one thread
+    together = min(processors(), len(tried)) if adjusts_without_blas(mapped) else 1
+    with ThreadPoolExecutor(together) as pool:  # COLMAP adjusts each in one thread
         found = pool.map(lambda model: adjusted(mapped, limited(model, inputs), inputs.known, seed), tried)
         steps = dict(zip(tried, found, strict=True))
     free = len(set(mapped.names.values()) - set(inputs.known))

@@ -2,7 +2,8 @@
 
 Every seed is set and extraction, matching and mapping run on one thread each: with automatic thread counts two runs
 on the same photos differ. Photos and pairs do not depend on each other, so that groups of them run side by side, each
-as it would alone. pycolmap is released often with renamed functions, so only this module and `mapping` import it.
+as it would alone: photos in threads, pairs in processes. pycolmap is released often with renamed functions, so only
+this module, `match_pairs` and `mapping` import it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import pycolmap
 
 from ...datasets.io.processors import processors
 from ...datasets.io.progress import progress
+from .match_pairs import match_apart, match_pairs
 from .reconstruction import VerifiedPair
 from .turntable import standing_features
 
@@ -231,31 +233,19 @@ def _drop_standing(database: Path) -> None:
 
 
 def _match(database: Path, names: Sequence[str], settings: SfmSettings) -> None:
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = 1
-    matching.use_gpu = False
-    matching.guided_matching = settings.guided_matching
-    matching.sift.max_ratio = settings.max_ratio
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = settings.seed
-    verification.ransac.num_threads = 1
-    verification.ransac.max_num_trials = settings.verification_trials
     read = feature_counts(database)
     blocks = sorted(_pair_blocks([name for name in names if name in read]), key=len, reverse=True)
     total = sum(map(len, blocks))
+    match = match_pairs if min(processors(), len(blocks)) == 1 else match_apart
+    values = {
+        "seed": settings.seed,
+        "guided_matching": settings.guided_matching,
+        "max_ratio": settings.max_ratio,
+        "verification_trials": settings.verification_trials,
+    }
 
     def work(place: Path, block: list[tuple[str, str]], token: Any) -> None:
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = place.with_suffix(".pairs.txt")
-        Path(pairing.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in block), encoding="utf-8")
-        pycolmap.match_image_pairs(
-            database_path=place,
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-            cancellation_token=token,
-        )
+        match(place, block, values, token)
         bar.update(len(block))
 
     with progress(range(total), "matches", total=total, unit="pair") as bar:

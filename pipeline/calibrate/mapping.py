@@ -131,6 +131,14 @@ def adjusted(mapped: Mapped, models: Map[str, str], known: Map[str, CameraIntrin
     return Mapped(reconstruction=copy, names=mapped.names)
 
 
+def adjusts_without_blas(mapped: Mapped) -> bool:
+    """Return whether models of so few images are adjusted with a dense solver, which needs no BLAS.
+
+    That of pycolmap's wheels must not be called twice at once, see `match_pairs`; sparse solvers call it.
+    """
+    return mapped.image_count <= pycolmap.BundleAdjustmentOptions().ceres.max_num_images_direct_dense_cpu_solver
+
+
 def with_focal_lengths(
     mapped: Mapped, focals_px: Map[str, float], known: Map[str, CameraIntrinsics], seed: int
 ) -> Mapped:
