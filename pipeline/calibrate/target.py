@@ -12,12 +12,13 @@ import numpy as np
 
 from ...datasets.capture.exif import photo_lens
 from ...datasets.capture.files import entries_of
-from ...datasets.capture.images import IMAGE_SUFFIXES, read_rgb
+from ...datasets.capture.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, read_rgb
 from ...datasets.io.atomic import new_file
 from ...datasets.io.outputs import reads
 from ...datasets.io.progress import progress
 from ...schemas import CameraIntrinsics, InputDataError, NotConvergedError
 from ...schemas.intrinsics import IntrinsicsFile, TargetPhoto
+from ...schemas.printable import typed_path
 from .reconstruction import Array
 from .target_board import charuco_board
 
@@ -69,6 +70,12 @@ def calibrate_target(folder: Path | str, overwrite: bool = False) -> IntrinsicsF
         UsageError: If other intrinsics are there, and `overwrite` is not set.
     """
     folder = Path(folder)
+    if not folder.is_dir():
+        raise InputDataError(
+            f"{folder}: {'is a file' if folder.is_file() else 'no such folder'}.",
+            "a folder of photos of the board, or a name .pdf or .svg for a new board.",
+            "check the path, or print a board with 'cgwm calibrate board.pdf --target charuco'.",
+        )
     path = folder / INTRINSICS_NAME
     if path.is_file() and not overwrite:
         file = _measured(folder)
@@ -96,12 +103,16 @@ def _text(file: IntrinsicsFile) -> str:
 
 
 def _measured(folder: Path) -> IntrinsicsFile:
-    names = [path.name for path in entries_of(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
+    entries = entries_of(folder)
+    names = [path.name for path in entries if path.suffix.lower() in IMAGE_SUFFIXES]
     if len(names) < MIN_PHOTOS:
+        unread = sorted({path.suffix for path in entries if path.suffix.lower() in UNREAD_SUFFIXES})
         raise InputDataError(
-            f"{folder}: {len(names)} photo(s).",
+            f"{folder}: {len(names)} photo(s)" + (f", and files {', '.join(unread)}." if unread else "."),
             f"at least {MIN_PHOTOS} photos of the board, .jpg or .png.",
-            "print a board with 'cgwm calibrate board.pdf --target charuco', and photograph it from all sides.",
+            f"convert them: cgwm import photos {typed_path(folder)} --out BOARD; then their folder is BOARD/images."
+            if unread
+            else "print a board with 'cgwm calibrate board.pdf --target charuco', and photograph it from all sides.",
         )
     seen, size, lens = _corners(folder, names)
     used = {one.name: one for one in seen if len(one.pixels) >= MIN_CORNERS}

@@ -76,6 +76,16 @@ def test_other_suffixes_are_refused(tmp_path: Path) -> None:
     assert str(caught.value).startswith(f"{tmp_path / 'board.png'}: a board is printed from .pdf or .svg.")
 
 
+def test_what_is_no_folder_of_photos_is_told(tmp_path: Path) -> None:
+    (tmp_path / "phone").mkdir()
+    (tmp_path / "phone" / "1.HEIC").write_bytes(b"photo")
+    for name, words in (("board.png", "no such folder"), ("phone", r"0 photo\(s\), and files \.HEIC\.")):
+        with pytest.raises(InputDataError, match=f"{name}: {words}"):
+            calibrate_target(tmp_path / name)
+    with pytest.raises(InputDataError, match=r"cgwm import photos .*phone --out BOARD"):
+        calibrate_target(tmp_path / "phone")
+
+
 def test_the_intrinsics_are_true_within_what_they_state(board: Path, file: IntrinsicsFile) -> None:
     camera = file.camera
     assert (camera.width, camera.height, camera.model) == (WIDTH, HEIGHT, "OPENCV")
