@@ -216,7 +216,9 @@ class HandScenePlant:
                 todo="correct the name in the task, or add the joint to the scene.",
             )
         number = model.joint(name).id
-        servos = [k for k in range(model.nu) if model.actuator_trntype[k] == 0 and model.actuator_trnid[k, 0] == number]
+        moves = [k for k in range(model.nu) if model.actuator_trntype[k] == 0 and model.actuator_trnid[k, 0] == number]
+        # a motor would take a target for a torque; a servo pulls towards its target, as hard as away from where it is
+        servos = [k for k in moves if model.actuator_gainprm[k, 0] > 0 > model.actuator_biasprm[k, 1]]
         if not servos:
             raise InputDataError(
                 f"{path}: joint '{name}' has no servo.",

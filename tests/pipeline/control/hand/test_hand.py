@@ -233,6 +233,15 @@ def test_both_plants_move_the_joint_that_is_commanded(controller: HandController
     )
 
 
+def test_a_motor_of_the_scene_is_no_servo(folder: Path, model: Model) -> None:
+    """It would take a target for a torque."""
+    servo = '<position joint="lift" kp="2" kv="0.1"/>'
+    (folder / "motor.xml").write_text((folder / "scene.xml").read_text().replace(servo, '<motor joint="lift"/>'))
+    hand = hand_world(model, hand_task(folder, plant={"kind": "mujoco", "scene": "motor.xml"}))
+    with pytest.raises(InputDataError, match="joint 'lift' has no servo"):
+        HandScenePlant(hand)
+
+
 def test_a_run_ends_at_its_time_or_when_the_object_is_dropped(controller: HandController) -> None:
     plant = HandScenePlant(controller.hand)
     found = run_hand(controller, plant, 0, "ideal")
