@@ -37,15 +37,15 @@ def read_intrinsics(path: Path) -> tuple[CameraIntrinsics, ...]:
 
 
 def known_by_size(capture: Capture, sizes: set[Size], file: Path | None) -> dict[Size, CameraIntrinsics]:
-    """Return the given intrinsics of photos by their size.
+    """Return the given intrinsics of photos and videos by their size.
 
     Args:
         capture: The capture, with the intrinsics of its manifest.
-        sizes: Sizes of its photos (width, height) [px].
+        sizes: Sizes of its photos and videos (width, height) [px].
         file: File of further ones, or None.
 
     Raises:
-        InputDataError: If the manifest has those of a size that no photo has, the file none of the photos' sizes, or
+        InputDataError: If the manifest has those of a size that nothing has, the file none of these sizes, or
             two are of one size.
     """
     manifest, name = capture.manifest.calibration.intrinsics, capture.root / "capture.toml"
@@ -73,7 +73,7 @@ def known_by_size(capture: Capture, sizes: set[Size], file: Path | None) -> dict
 def _other_size(found: str, given: list[Size], sizes: set[Size]) -> InputDataError:
     wrong, right = (", ".join(f"{width}x{height}" for width, height in sorted(some)) for some in (given, sizes))
     return InputDataError(
-        f"{found} of photos of {wrong}, and no photo has that size.",
+        f"{found} of photos of {wrong}, and no photo or video has that size.",
         f"the size of photos that are there: {right}.",
         "give the intrinsics at the size of the photos (fx, fy, cx and cy grow with the size).",
     )

@@ -106,7 +106,7 @@ def gather(capture: Capture, folder: Path, intrinsics: Path | None = None, turnt
             continue
         sources.append(_video_source(folder, root, camera, frames[0], masks[0]))
         richest[f"video-{camera}"] = "SIMPLE_PINHOLE"  # one frame does not determine a lens
-    known = _known(capture, sources, intrinsics)
+    known = _known(capture, sources, root, intrinsics)
     return Inputs(root, tuple(sources), tuple(notes), moving, richest, known)
 
 
@@ -145,10 +145,17 @@ def _shifts(first: MatLike, other: MatLike, corners: MatLike) -> NDArray[np.floa
     return np.choose(best, lengths)[np.isfinite(np.min(errors, axis=0))]
 
 
-def _known(capture: Capture, sources: Sequence[Source], file: Path | None) -> dict[str, CameraIntrinsics]:
-    """Return the given intrinsics by camera; refuse those of a size that no photo has."""
+def _known(capture: Capture, sources: Sequence[Source], root: Path, file: Path | None) -> dict[str, CameraIntrinsics]:
+    """Return the given intrinsics by camera, of a video camera those of a size that no photo has.
+
+    Raises:
+        InputDataError: If some are of a size that nothing has.
+    """
+    videos = [source.image for source in sources if source.label.startswith(video_label(""))]
     photos = [source for source in sources if not source.label.startswith(video_label(""))]
     sizes = {source.image.camera: image_size(capture.root / "images" / source.label) for source in photos}
+    frames = {image.camera: image_size(root / image.name) for image in videos}
+    sizes |= {camera: size for camera, size in frames.items() if size not in sizes.values()}
     given = known_by_size(capture, set(sizes.values()), file)
     return {camera: given[size] for camera, size in sizes.items() if size in given}
 

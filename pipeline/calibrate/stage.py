@@ -367,16 +367,27 @@ def _wrong_exif(best: Candidate) -> list[str]:
 
 
 def _uncertain_centers(stds_percent: dict[str, float]) -> list[str]:
-    uncertain = [image for image, std in stds_percent.items() if std > 100.0 * UNCERTAIN_CENTER]
-    if not uncertain:
-        return []
-    worst = max(uncertain, key=lambda image: stds_percent[image])
-    return [
-        f"the optical centres of {len(uncertain)} of {len(stds_percent)} registered images are less certain than "
-        f"{100.0 * UNCERTAIN_CENTER:g} % of their extent ({worst}: {stds_percent[worst]:.2g} %): few matches tie them "
-        "to the others, or the lens is long; more photos between them, surroundings with texture or known intrinsics "
-        "([[calibration.intrinsics]]) make them certain"
-    ]
+    limit, prefix = 100.0 * UNCERTAIN_CENTER, video_label("")
+    uncertain = {image: std for image, std in stds_percent.items() if std > limit}
+    videos = {image.removeprefix(prefix): std for image, std in uncertain.items() if image.startswith(prefix)}
+    photos = {image: std for image, std in uncertain.items() if not image.startswith(prefix)}
+    warnings = []
+    if photos:
+        worst = max(photos, key=lambda image: photos[image])
+        warnings.append(
+            f"the optical centres of {len(photos)} of {len(stds_percent)} registered images are less certain than "
+            f"{limit:g} % of their extent ({worst}: {photos[worst]:.2g} %): few matches tie them to the others, or the "
+            "lens is long; more photos between them, surroundings with texture or known intrinsics "
+            "([[calibration.intrinsics]]) make them certain"
+        )
+    if videos:
+        listed = ", ".join(f"{camera}: {std:.2g} %" for camera, std in sorted(videos.items()))
+        warnings.append(
+            f"the optical centres of video cameras are less certain than {limit:g} % of the extent of all ({listed}): "
+            "one frame hardly tells where its lens is centred; known intrinsics ([[calibration.intrinsics]]; a printed "
+            "board measures them, --target charuco) make them certain"
+        )
+    return warnings
 
 
 def _uncertain_rotations(stds_deg: dict[str, float]) -> list[str]:

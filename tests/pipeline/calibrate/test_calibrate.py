@@ -14,12 +14,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cgwm.datasets import Capture
 from cgwm.datasets.capture.cameras import read_cameras, require_metric
 from cgwm.datasets.capture.sparse_points import read_points
-from cgwm.pipeline.calibrate import attempts, calibrate, colmap, mapping
+from cgwm.pipeline.calibrate import attempts, calibrate, colmap, mapping, stage
 from cgwm.pipeline.calibrate.consistency_check import PairCheck, SelfCheck
 from cgwm.pipeline.calibrate.markers import dictionary
-from cgwm.pipeline.calibrate.photos import background_flow
+from cgwm.pipeline.calibrate.photos import background_flow, gather
 from cgwm.schemas import (
     CalibrateConfig,
     CalibrationReport,
@@ -347,12 +348,37 @@ def test_known_intrinsics_are_used_and_two_runs_give_the_same_cameras_on_any_num
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (420.0, 420.0, 200.0, 150.0, ())
 
 
+@pytest.mark.parametrize(("size", "cameras"), [((80, 60), ["video-left"]), ((120, 90), ["photos"])])
+def test_known_intrinsics_of_a_videos_size_are_those_of_its_camera(tmp_path, size, cameras):
+    """Those of a size that photos have are of the photos, whose camera may be another one than that of the videos."""
+    (tmp_path / "capture" / "images").mkdir(parents=True)
+    (tmp_path / "capture" / "videos" / "left" / "000").mkdir(parents=True)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "capture" / "images" / f"{k}.png"), _texture(120, k)[:90])
+    frame = _texture(120, 3)[: size[1], : size[0]]
+    for k in range(2):
+        cv2.imwrite(str(tmp_path / "capture" / "videos" / "left" / "000" / f"{k:06d}.png"), frame)
+    lens = f"width = {size[0]}\nheight = {size[1]}\nfx = 70.0\nfy = 70.0\ncx = 40.0\ncy = 30.0\n"
+    manifest = f'{MANIFEST}[[calibration.intrinsics]]\nmodel = "PINHOLE"\n{lens}'
+    (tmp_path / "capture" / "capture.toml").write_text(manifest)
+    inputs = gather(Capture.open(tmp_path / "capture"), tmp_path)
+    assert list(inputs.known) == cameras and inputs.known[cameras[0]].fx == 70.0
+
+
+def test_uncertain_video_cameras_have_a_warning_of_their_own():
+    assert stage._uncertain_centers({"1.jpg": 0.01, "video:left": 0.05}) == []
+    photos, videos = stage._uncertain_centers({"1.jpg": 0.2, "2.jpg": 0.01, "video:left": 0.4, "video:right": 0.05})
+    assert "1 of 4 registered images" in photos and "1.jpg: 0.2 %" in photos and "left" not in photos
+    assert "(left: 0.4 %)" in videos and "--target charuco" in videos
+
+
 def test_known_intrinsics_of_another_size_are_refused(scene, tmp_path):
     root = _fresh(scene, tmp_path, MANIFEST + KNOWN.replace("width = 400", "width = 800"), photos=3)
     with pytest.raises(InputDataError) as caught:
         calibrate(root, CONFIG)
     assert str(caught.value) == (
-        f"{root / 'capture.toml'}: [[calibration.intrinsics]] are of photos of 800x300, and no photo has that size.\n"
+        f"{root / 'capture.toml'}: [[calibration.intrinsics]] are of photos of 800x300, and no photo or video has that "
+        "size.\n"
         "Allowed: the size of photos that are there: 400x300.\n"
         "Next: give the intrinsics at the size of the photos (fx, fy, cx and cy grow with the size)."
     )

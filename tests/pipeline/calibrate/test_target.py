@@ -142,7 +142,7 @@ def test_a_capture_takes_the_intrinsics_of_its_photos_size(file: IntrinsicsFile,
     given = board / "intrinsics.json"
     assert gather(Capture.open(root), tmp_path / "a", given).known == {"photos": file.camera}
     cv2.imwrite(str(root / "images" / "0.png"), np.zeros((WIDTH, HEIGHT, 3), np.uint8))
-    with pytest.raises(InputDataError, match="its intrinsics are of photos of 640x480, and no photo has that size"):
+    with pytest.raises(InputDataError, match="are of photos of 640x480, and no photo or video has that size"):
         gather(Capture.open(root), tmp_path / "b", given)
     other = tmp_path / "other.json"
     other.write_text(json.dumps({"format": "cgwm-model/1"}))
