@@ -30,6 +30,9 @@ from .quantities import Duration, Friction, Length, Position3, Step
 from .regular_files import read_text_file
 
 HAND_FORMAT = "cgwm-hand-task/1"
+FARTHEST_DEG = 175.0
+"""Largest distance of a random goal from the last that may be asked for [deg]: one of 18 orientations is as far away,
+and none is farther than 180."""
 Quaternion = tuple[float, float, float, float]
 
 
@@ -231,6 +234,8 @@ class HandTask(TaskSection):
                 raise ValueError(f"{name}.quat_wxyz = {list(quat)} is not of length 1")
         if not any(self.goal.axis):
             raise ValueError("goal.axis is zero")
+        if self.goal.kind == "random" and self.goal.turn_deg > FARTHEST_DEG:
+            raise ValueError(f"goal.turn_deg = {self.goal.turn_deg:g} of random goals is more than {FARTHEST_DEG:g}")
         if self.start.turn_deg[1] < self.start.turn_deg[0]:
             raise ValueError(f"start.turn_deg is a range [low, high]; found {list(self.start.turn_deg)}")
         return self

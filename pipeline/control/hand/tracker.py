@@ -31,6 +31,8 @@ in 20 ms."""
 FELT = (math.radians(0.4), 0.5)
 """Standard deviations of what such a prediction lacks of the joints [rad] and of their speeds [rad/s] at its end. They
 are measured without noise, so that a finger that the object stops tells where that is."""
+LEAST_NOISE = (1e-4, math.radians(0.1))
+"""Smallest standard deviations of place [m] and turn [rad] that poses are filtered with: one of them may be exact."""
 LONGEST_S = 0.25
 """Time without a state after which the next one is believed as it is [s]."""
 WINDOW_S = 0.2
@@ -100,7 +102,8 @@ class HandTracker:
     def __init__(self, hand: HandWorld, worlds: Worlds) -> None:
         sensing = hand.task.sensing
         self._hand, self._worlds = hand, worlds
-        self._noise = np.array([sensing.noise_m, math.radians(sensing.noise_deg)])
+        noise = np.array([sensing.noise_m, math.radians(sensing.noise_deg)])
+        self._noise = np.maximum(noise, LEAST_NOISE) if noise.any() else noise
         self.restart(0)
 
     def restart(self, seed: int) -> None:

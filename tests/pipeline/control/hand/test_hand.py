@@ -216,6 +216,8 @@ def test_goals_are_the_turn_of_the_task_or_far_enough_apart(folder: Path) -> Non
     drawn = [torch.as_tensor(next(far)) for _ in range(8)]
     for one, other in pairwise(drawn):
         assert math.degrees(float(quat_turn(other, one).norm())) >= 60
+    with pytest.raises(ValueError, match=r"goal\.turn_deg = 180 of random goals is more than 175"):
+        hand_task(folder, goal={"kind": "random", "turn_deg": 180.0})
 
 
 @pytest.mark.parametrize("kind", [HandModelPlant, HandScenePlant])

@@ -66,10 +66,13 @@ def errors_while_pushing(controller: HandController, **plant: Any) -> np.ndarray
     return np.array(errors)
 
 
-def test_noisy_poses_are_filtered_while_the_object_is_pushed(unsure: tuple[Path, Model]) -> None:
-    controller = HandController(unsure[1], hand_task(unsure[0], sensing=NOISE))
-    errors = errors_while_pushing(controller, **NOISE)[6:]
-    raw = math.sqrt(3) * np.array([0.003, math.radians(3)])
+@pytest.mark.parametrize("noise", [NOISE, {"noise_m": 0.003}])
+def test_noisy_poses_are_filtered_while_the_object_is_pushed(
+    unsure: tuple[Path, Model], noise: dict[str, float]
+) -> None:
+    controller = HandController(unsure[1], hand_task(unsure[0], sensing=noise))
+    errors = errors_while_pushing(controller, **noise)[6:]
+    raw = math.sqrt(3) * np.array([0.003, math.radians(noise.get("noise_deg", 0.3))])
     assert (np.sqrt(np.square(errors).mean(0)) < 0.6 * raw).all()
 
 
