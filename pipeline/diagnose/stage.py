@@ -45,7 +45,7 @@ from ..runtime.work_budget import motion_doubt, within_budget
 from ..segments.candidates import Candidate, admissible, without_effects
 from ..segments.center_of_mass import as_one_body
 from ..segments.described_motion import not_described
-from ..segments.flights.residual_wrench import Omnibus, covariates_of, wrench_windows
+from ..segments.flights.residual_wrench import Omnibus, covariates_of
 from ..segments.group_parameters import with_known_groups
 from ..segments.input_checks import check_observability, check_units_and_geometry
 from ..segments.prepare import Prepared, prepare
@@ -357,11 +357,9 @@ def _law(prepared: Prepared, findings: Findings) -> ResidualLaw | None:
 
     For the verdict "unexplained" the residual is that of the model's world, else that with the selected effects.
     """
-    if prepared.flight is None:
-        return None
     withheld = [one.effect for one in findings.flight.withheld]
     world = findings.base if findings.verdict == "unexplained" else without_effects(findings.world, *withheld)
-    windows = wrench_windows(world, prepared.observations, prepared.flight.items, prepared.noise, prepared.noise_model)
+    windows = world.once(prepared.short_windows)
     if windows is None:
         return None
     law = residual_law(windows)

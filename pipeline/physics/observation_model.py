@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .effects.effect import Poses
 from .engine import rollout as rolled_out
-from .rollout import Rollout
+from .rollout import Rollout, rows_of_times
 from .state import State
 from .world import World
 
@@ -25,7 +25,7 @@ def measure(world: World, state: State, times_s: Tensor, driven: Mapping[str, Tr
     Args:
         world: The world; its effects may change times and poses.
         state: The true state at the true first time.
-        times_s: Recorded times [s], shape (T,) or (B, T).
+        times_s: Recorded times [s], shape (T,) or (B, T), or (b, T) of a batch in which b rows repeat.
         driven: The command of each driven body, in true time.
 
     Returns:
@@ -34,6 +34,8 @@ def measure(world: World, state: State, times_s: Tensor, driven: Mapping[str, Tr
     Raises:
         InputDataError: See :func:`simulate`.
     """
+    if any(active.effect.has("times") for active in world.effects):
+        times_s = rows_of_times(times_s, len(state.position_m))
     return as_measured(world, rolled_out(world, state, true_times(world, times_s), driven), times_s)
 
 

@@ -63,7 +63,7 @@ def simulate(
     Args:
         world: The world; its tensors and the state's broadcast over the batch B.
         state: The state at the first time; driven and fixed bodies take theirs from `driven` or keep it.
-        times_s: Frame times [s], increasing, shape (T,) or (B, T).
+        times_s: Frame times [s], increasing, shape (T,) or (B, T), or (b, T) of a batch in which b rows repeat.
         driven: The command of each driven body: a track, or a prepared `Drive`; of the servos of a chain, under the
             name of the chain: a `JointCommand`.
         record_contacts: Whether to keep the contacts of every frame.
@@ -101,6 +101,12 @@ def simulate(
     )
 
 
+def rows_of_times(times_s: Tensor, count: int) -> Tensor:
+    """Return times (T,), (B, T) or (b, T) as rows (1 or B, T), those of a batch (count) in which b rows repeat."""
+    rows = times_s if times_s.ndim == 2 else times_s[None]
+    return rows.repeat(count // len(rows), 1) if 1 < len(rows) < count else rows
+
+
 class Engine:
     """Time stepper of one rollout: its constants, and the contacts of the last step, which warm-start the next.
 
@@ -118,7 +124,7 @@ class Engine:
         if world.effects:
             require_physical(world)  # an effect may have made a body that cannot be
         self.inertias = [Inertia.of(body) for body in world.bodies]
-        self.times = times_s if times_s.ndim == 2 else times_s[None]
+        self.times = rows_of_times(times_s, len(state.position_m))
         self.lengths = self.times.diff(dim=1)
         self.substeps = world.substeps(self.times)
         self.wrenches = [active for active in world.effects if active.effect.has("wrench")]

@@ -47,6 +47,10 @@ class EpisodePhases:
 
 def is_round(body: Body) -> bool:
     """Return whether a body is a ball about its frame's origin: its contacts do not depend on its orientation."""
+    return body.once(_is_round)
+
+
+def _is_round(body: Body) -> bool:
     return bool((body.centers[0].square().sum(-1).sqrt() < 1e-3 * body.radii[0].max()).all())
 
 

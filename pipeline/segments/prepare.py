@@ -24,6 +24,7 @@ from ..trajectories.time_errors import time_errors, time_shifts
 from ..trajectories.track_noise import Noise, noise_of
 from .carried_starts import carried_starts
 from .contact_phases import is_round
+from .flights.residual_wrench import ResidualWrenches, wrench_windows
 from .release_detection import held_starts, release_warnings, without_held
 from .segment_states import fit_states
 from .segments import Kind, Segments
@@ -125,7 +126,14 @@ class Prepared:
 
     def with_own(self, world: World) -> Prepared:
         """Return the episodes with the values of their own that a world has for them."""
-        return replace(self, observations=self.observations.with_own(world))
+        seen = self.observations.with_own(world)
+        return self if seen is self.observations else replace(self, observations=seen)
+
+    def short_windows(self, world: World) -> ResidualWrenches | None:
+        """Return the residual wrenches of short windows of the flights; None without any."""
+        if self.flight is None:
+            return None
+        return wrench_windows(world, self.observations, self.flight.items, self.noise, self.noise_model)
 
     def pieces(self, world: World, longest_s: float) -> Segments | None:
         """Return the flights cut into equal pieces of at most a length [s], states fitted; None without flights."""

@@ -65,7 +65,8 @@ class Observations:
 
     def with_own(self, world: World) -> Observations:
         """Return the items with the group-specific parameters that a world has for their episodes."""
-        return replace(self, own_values=_own(world, self.names))
+        own = _own(world, self.names)
+        return replace(self, own_values=own) if own or self.own_values else self
 
     def world(self, world: World, repeats: int = 1) -> World:
         """Return a world with the items' group-specific parameters, for the batch repeated `repeats` times."""

@@ -139,7 +139,7 @@ class TrajectoryResiduals:
             world = apply_parameters(world, self.parameters, torch.stack(values, -1))
         state = on_joints(world, retract(seen.state.repeat(repeats), inputs[:, count:], seen.free))
         drives = {name: drive.repeat(repeats) for name, drive in seen.drives.items()}
-        return measure(world, state, seen.times_s[:, :frames].repeat(repeats, 1), drives)
+        return measure(world, state, seen.times_s[:, :frames], drives)
 
     def _residuals(self, inputs: Tensor, repeats: int) -> Tensor:
         """Return the flat residuals (repeats * B, F * 6) of inputs (repeats * B, P + S).

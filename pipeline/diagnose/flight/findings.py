@@ -18,7 +18,7 @@ from ...physics.parameters import effect_parameters
 from ...physics.world import World
 from ...segments.candidates import Candidate, admissible, variants_of
 from ...segments.flights.repeated_forces import RepeatedForce, repeated_force
-from ...segments.flights.residual_wrench import Omnibus, ResidualWrenches, dispersion, wrench_windows
+from ...segments.flights.residual_wrench import Omnibus, ResidualWrenches, dispersion
 from ...segments.flights.slow_errors import SlowErrors, flight_errors, tell_errors
 from ...segments.linearization import linearize
 from ...segments.prepare import Prepared
@@ -334,7 +334,7 @@ def _left(prepared: Prepared, world: World, after_flight: World, selected: bool)
     if prepared.flight is None:
         return None, 1.0
     worlds = [world, after_flight] if selected else [world]
-    found = [_wrenches(prepared, one) for one in worlds]
+    found = [one.once(prepared.short_windows) for one in worlds]
     laws = [None if one is None else repeated_force(one) for one in found]
     last = laws[-1]
     if last is None or found[0] is None or found[-1] is None:
@@ -342,14 +342,6 @@ def _left(prepared: Prepared, world: World, after_flight: World, selected: bool)
     explained = _square(found[0]) - _square(found[-1])
     gain = max(last.gain, 0.0)
     return last, explained / (explained + gain) if explained + gain > 0 and selected else float(gain <= 0)
-
-
-def _wrenches(prepared: Prepared, world: World) -> ResidualWrenches | None:
-    """Return the residual wrenches of short windows of flight; None without any."""
-    if prepared.flight is None:
-        return None
-    items, noise = prepared.flight.items, prepared.noise
-    return wrench_windows(world, prepared.observations, items, noise, prepared.noise_model)
 
 
 def _square(found: ResidualWrenches) -> float:

@@ -26,7 +26,7 @@ from ...physics.parameters import Parameter
 from ...physics.rollout import Rollout
 from ...physics.state import State
 from ...physics.world import World
-from ...segments.candidates import Variant, base_values, with_variants
+from ...segments.candidates import Together, Variant, base_values
 from ...segments.impacts.fit import ImpactBase
 from ...segments.impacts.velocities import measured_impacts
 from ...segments.prepare import Prepared
@@ -34,10 +34,9 @@ from ...segments.segment_states import fit_states
 from ...segments.segments import Segments
 from ...segments.sliding.descent import WEAK
 from ...segments.sliding.fit import StartedSliding, nuisance_parameters
-from ...segments.sliding.residuals import LoadErrors, finite_differences, soft_world
+from ...segments.sliding.residuals import finite_differences, soft_world
 from ...segments.sliding.segments import find_sliding_segments
 from ...trajectories.segmentation import GroundPlane, cut_episodes, whole_episodes
-from ..contact.sliding import batches
 from .hand_motions import HandMotion, start_states
 
 Array = NDArray[np.float64]
@@ -242,31 +241,21 @@ def _eliminated(
     segments: Segments, soft: World, known: Sequence[Parameter], values: Tensor, variants: Sequence[Variant]
 ) -> Array:
     """Return the information (B, P, P) of sliding segments with their states eliminated, the known parameters first."""
-    count = len(segments.items)
-    columns: dict[int, Tensor] = {}
-    first, loads = None, LoadErrors.of(segments.in_world(soft))
-    for part in batches(variants, alike=False):
-        extended, own = with_variants(soft, part, "contact")
-        parameters = [*known, *own]
-        every = torch.cat([values, torch.zeros(len(own)).to(values)]).expand(count, len(parameters))
-        # the nuisance parameters and the states are the same in all parts
-        asked = torch.arange(0 if first is None else len(known), len(parameters)).expand(count, -1)
-        own_segments = segments.in_world(extended)
-        found = finite_differences(own_segments, parameters, every, asked, loads, by_states=first is None)
-        slopes = found.jacobian
-        if first is None:
-            first, slopes = found, slopes[..., len(known) :]
-        place = 0
-        for variant in part:
-            width = len(variant.parameters)
-            columns[variants.index(variant)] = slopes[..., place : place + width]
-            place += width
-    assert first is not None  # there are candidates
-    states = first.jacobian.shape[-1] - len(known) - sum(len(v.parameters) for v in batches(variants, alike=False)[0])
-    pieces = [first.jacobian[..., : len(known)], *(columns[k] for k in range(len(variants)))]
-    jacobian = torch.cat([*pieces, first.jacobian[..., -states:]], -1)
-    size = jacobian.shape[-1] - states
-    normal = NormalEquations.of_rows(first.rows, jacobian, size, first.chi2, prior=WEAK)
+    together, first, count = Together.of(soft, variants), len(known), len(segments.items)
+    parameters = [*known, *together.parameters]
+    every = base_values(together.world, parameters).repeat(1 + len(variants), 1)
+    every[:, :first] = values
+    together.set_constants(every[1:], first)
+    owner = [0] * first + [1 + k for k, columns in enumerate(together.columns) for _ in columns]
+    asked = torch.tensor([*range(first), *(first + column for columns in together.columns for column in columns)])
+    found = finite_differences(
+        segments.in_world(together.world),
+        parameters,
+        every[0].expand(count, -1),
+        asked.expand(count, -1),
+        at=every[owner][:, None].expand(-1, count, -1),
+    )
+    normal = NormalEquations.of_rows(found.rows, found.jacobian, len(owner), found.chi2, prior=WEAK)
     return np.nan_to_num(normal.eliminated().information.numpy())
 
 

@@ -17,7 +17,7 @@ from ...physics.impulse_solver import tangent_axes
 from ...physics.state import State
 from ...physics.world import World
 from ...segments.candidates import without_effects
-from ...segments.flights.residual_wrench import ResidualWrenches, covariates_of, motion_axes, wrench_windows
+from ...segments.flights.residual_wrench import ResidualWrenches, covariates_of, motion_axes
 from ...segments.prepare import Prepared, whole_flights
 from ...segments.segments import Segments
 from ..next_experiment.experiments import Experiment
@@ -133,9 +133,7 @@ def pictures_of(prepared: Prepared, findings: Findings, result: DiagnoseResult) 
 
 
 def _windows(prepared: Prepared, world: World) -> ResidualWrenches | None:
-    if prepared.flight is None or len(world.free) != 1:
-        return None
-    return wrench_windows(world, prepared.observations, prepared.flight.items, prepared.noise, prepared.noise_model)
+    return world.once(prepared.short_windows) if len(world.free) == 1 else None
 
 
 def _missing(found: ResidualWrenches, turned: bool, coordinate: str | None = None) -> MissingForce:

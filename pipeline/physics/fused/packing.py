@@ -17,6 +17,7 @@ from ..contact_law import ContactLaw, coefficients
 from ..kinematic import Drive
 from ..pair_laws import laws_in_use
 from ..rigid_body import start
+from ..rollout import rows_of_times
 from ..state import State
 from ..surfaces.fixed_surface import HALF_SPACE, FixedSurface
 from ..world import World
@@ -114,7 +115,7 @@ def pack(
     return Packed(
         structure=world.once(_Layout(record, tuple(commands.bodies), tuple(commands.chains))),
         table=table.expand(batch, -1),
-        steps=steps,
+        steps=steps if len(steps) in (1, batch) else steps.repeat(batch // len(steps), 1, 1),
         geometry=fixed.geometry,
         surfaces=fixed.surfaces,
         mesh_numbers=fixed.meshes.numbers.to(times),
@@ -186,7 +187,7 @@ class _Fixed:
 
 def _fixed(world: World) -> _Fixed:
     turn = None if world.ground_normal is None else upright(world.ground_normal)
-    hulls = [row for body in world.bodies for row in _hull_rows(body)]
+    hulls = [row for body in world.bodies for row in body.once(_hull_rows)]
     surfaces = [_surface(surface, turn) for surface in world.surfaces]
     listed, lowest = _listed_spheres(world)
     effects, meshes = wrenches.coefficients(world), packed_meshes(world.surfaces)
@@ -194,7 +195,7 @@ def _fixed(world: World) -> _Fixed:
     return _Fixed(
         turn=turn,
         effects=effects,
-        geometry=joined([*map(_spheres, world.bodies), *hulls, *_patch_rows(world)]),
+        geometry=joined([*(body.once(_spheres) for body in world.bodies), *hulls, *_patch_rows(world)]),
         surfaces=joined(surfaces) if surfaces else world.gravity.new_zeros(1, 0, SURFACE_WIDTH),
         spheres=listed,
         meshes=meshes,
@@ -274,11 +275,12 @@ def _steps(laws: Sequence[ContactLaw], times: Tensor, substeps: Tensor) -> Tenso
         zero = torch.zeros_like(times)
         further = zero.expand(times.shape[0], 2 * len(laws) - 2)
         return torch.cat((zero.expand(times.shape[0], 3), times, further), -1)[:, None]
-    h = times.diff(dim=1) / substeps
     time, ratio = (
         torch.stack(torch.broadcast_tensors(*(getattr(law, name) for law in laws)), -1)[:, None]
         for name in ("contact_time_s", "damping_ratio")
     )
+    times = rows_of_times(times, max(len(time), len(ratio)))
+    h = times.diff(dim=1) / substeps
     each = torch.stack(coefficients(time, ratio, h[..., None]), -1)
     parts = (h[..., None], each[..., 0, :], times[:, :-1, None], each[..., 1:, :].flatten(-2))
     batch = max(map(len, parts))

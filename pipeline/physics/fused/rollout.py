@@ -62,7 +62,7 @@ def simulate_fused(
     Args:
         world: The world; its tensors and the state's broadcast over the batch B.
         state: The state at the first time; driven and fixed bodies take theirs from `driven` or keep it.
-        times_s: Frame times [s], increasing, shape (T,) or (B, T).
+        times_s: Frame times [s], increasing, shape (T,) or (B, T), or (b, T) of a batch in which b rows repeat.
         driven: The command of each driven body: a track, or a prepared `Drive`; of the servos of a chain, under the
             name of the chain: a `JointCommand`.
         record_contacts: Whether to keep the contacts of every frame.

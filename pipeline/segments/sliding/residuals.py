@@ -130,7 +130,7 @@ def finite_differences(
     values: Tensor,
     free: Tensor,
     loads: LoadErrors | None = None,
-    by_states: bool = True,
+    at: Tensor | None = None,
 ) -> SlidingDifferences:
     """Return residuals of sliding segments with their derivatives by parameters and states.
 
@@ -140,17 +140,18 @@ def finite_differences(
         values: Of each segment (B, P), in fitted coordinates.
         free: Indices (B, S) of the parameters by which the first S derivatives are; -1 for a derivative of 0.
         loads: Model errors of the loads of the segments, where they are known.
-        by_states: Whether also by the states; otherwise the basis has no columns.
+        at: Values (S, B, P) at which each of these derivatives is; all leave the residuals of `values`, the default.
     """
-    basis = _basis(segments)[..., slice(None) if by_states else slice(0)]
+    basis = _basis(segments)
     k, (n, size) = basis.shape[-1], free.shape
     steps = torch.tensor([PARAMETER_STEP * p.prior[1] for p in parameters]).to(values)
     still = torch.zeros(n, STATE_SIZE).to(values)
     changes, moves = [still], [values]
     for column in range(size):
-        at = free[:, column, None].clamp_min(0)
+        place = free[:, column, None].clamp_min(0)
         changes.append(still)
-        moves.append(values.scatter_add(1, at, steps[at] * (free[:, column, None] >= 0)))
+        start = values if at is None else at[column]
+        moves.append(start.scatter_add(1, place, steps[place] * (free[:, column, None] >= 0)))
     changes += [sign * basis[..., j] for j in range(k) for sign in (1.0, -1.0)]
     moves += [values] * (2 * k)
     rows = segments.varied(parameters, torch.stack(moves), torch.stack(changes))

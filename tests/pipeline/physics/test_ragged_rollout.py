@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 from cgwm.pipeline.physics import Rollout, State, simulate
+from cgwm.pipeline.physics.effects.effect import ActiveEffect
+from cgwm.pipeline.physics.effects.registry import load_effect
 from cgwm.pipeline.physics.engine import LEAST_SAVED, length_groups, ragged_rollout
+from cgwm.pipeline.physics.observation_model import measure
 from helpers.worlds import F64, ball_body, state_of, world_of
 
 
@@ -38,3 +44,23 @@ def test_the_motion_is_the_same_up_to_each_end_and_then_keeps_its_last_frame() -
         for item, end in ((0, 4), (1, 9), (2, 4)):
             assert torch.equal(values[:, item, :end], expected[item, :end].expand(repeats, -1, -1, -1))
             assert torch.equal(values[:, item, end:], values[:, item, end - 1 : end].expand(-1, 9 - end, -1, -1))
+
+
+@pytest.mark.parametrize("varied", ["nothing", "contact_time", "clock_scale"])
+def test_times_whose_rows_repeat_need_not_be_repeated(varied: str) -> None:
+    world = world_of(ball_body(), step_s=0.01)
+    rows = torch.linspace(0.9, 1.1, 6, dtype=F64)
+    if varied == "contact_time":
+        world = replace(world, contact=replace(world.contact, contact_time_s=0.02 * rows))
+    elif varied == "clock_scale":
+        clock = ActiveEffect.of(load_effect("clock_scale"), {}, world.gravity[0, :1])
+        world = replace(world, effects=(replace(clock, values={"s": rows - 1}),))
+    state = State.joined(*(state_of(((0, 0, 0.1 + 0.1 * k), (1, 0, 0, 0), (k, 0, 0), (0, k, 1))) for k in range(6)))
+    times = torch.arange(9, dtype=F64) / 50 * torch.tensor([[1.0], [1.5]], dtype=F64)
+    for roll in (measure, simulate):
+        if roll is simulate and varied == "clock_scale":
+            continue  # an effect of the measurement
+        short, full = roll(world, state, times), roll(world, state, times.repeat(3, 1))
+        assert torch.equal(short.position_m, full.position_m)
+        assert torch.equal(short.omega_body_rad_s, full.omega_body_rad_s)
+        assert not torch.equal(full.position_m[0], full.position_m[1])
