@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...datasets.synthetic import TruthFile
 from ...schemas import EpisodeCurves, ErrorCurve
 from ..evaluate.prediction import BALLISTIC, FROZEN, MODEL, EpisodePrediction
-from ..rendering.contact_sheets import FrameStrip, jpeg_uri, sprite, telling, tiles
+from ..rendering.contact_sheets import TILE_WIDTH, FrameStrip, columns_and_rows, jpeg_uri, sprite, telling, tiles
 from ..report.charts import Chart, Line, chart_svg, decades
 from ..report.page import paragraph, section, text
 
@@ -133,11 +133,13 @@ def film_section(strips: Sequence[FrameStrip]) -> tuple[str, str]:
     for episode in dict.fromkeys(strip.episode for strip in strips):
         views = [strip for strip in strips if strip.episode == episode]
         names = [f"f{len(rules) + k}" for k in range(2 * len(views))]
+        count = min(len(strip.real) for strip in views)
+        columns, rows = columns_and_rows(count, TILE_WIDTH)
         for k, strip in enumerate(views):
             for name, frames in zip(names[2 * k : 2 * k + 2], tiles(strip), strict=True):
-                size = f"background-size:{len(frames) * 100}% 100%"
-                rules.append(f".{name}{{background-image:url({jpeg_uri(sprite(frames), 72)});{size}}}")
-        pieces += [f"<h3>Test episode {text(episode)}</h3>", _player(views, names), _sheet(views, names)]
+                picture = jpeg_uri(sprite(frames[:count]), 72)
+                rules.append(f".{name}{{background-image:url({picture});background-size:{columns}00% {rows}00%}}")
+        pieces += [f"<h3>Test episode {text(episode)}</h3>", _player(views, names, count), _sheet(views, names, count)]
     words = (
         "Above: recorded frames. Below: the model's prediction from the first 0.1 s of the pose track, rendered from "
         "its spheres. The yellow outline is the object's true silhouette. The frames are cropped to the motion."
@@ -146,16 +148,14 @@ def film_section(strips: Sequence[FrameStrip]) -> tuple[str, str]:
 
 
 def _tile(name: str, frame: int, count: int, label: str) -> str:
-    place = 100 * frame / (count - 1) if count > 1 else 0
-    return (
-        f'<div class="tile {name}" role="img" aria-label="{text(label)}" style="background-position:{place:.3f}% 0">'
-        "</div>"
-    )
+    columns, rows = columns_and_rows(count, TILE_WIDTH)
+    across, down = (100 * k / max(of - 1, 1) for k, of in ((frame % columns, columns), (frame // columns, rows)))
+    style = f"background-position:{across:.3f}% {down:.3f}%"
+    return f'<div class="tile {name}" role="img" aria-label="{text(label)}" style="{style}"></div>'
 
 
-def _sheet(strips: Sequence[FrameStrip], names: Sequence[str]) -> str:
+def _sheet(strips: Sequence[FrameStrip], names: Sequence[str], count: int) -> str:
     """Return rows of frames at equal time steps, real above predicted for each camera."""
-    count = min(len(strip.real) for strip in strips)
     chosen = [k for k in telling(strips[0], SHEET_COLUMNS) if k < count]
     cells = ["<span></span>", *(f'<span class="time">{strips[0].times_s[k]:.2f} s</span>' for k in chosen)]
     cells += ["<span></span>"] * (SHEET_COLUMNS - len(chosen))
@@ -168,9 +168,9 @@ def _sheet(strips: Sequence[FrameStrip], names: Sequence[str]) -> str:
     return f'<div class="scroll"><div class="sheet">{"".join(cells)}</div></div>'
 
 
-def _player(strips: Sequence[FrameStrip], names: Sequence[str]) -> str:
+def _player(strips: Sequence[FrameStrip], names: Sequence[str], count: int) -> str:
     """Return the real and predicted views side by side, with a slider for the frame."""
-    count = min(len(strip.real) for strip in strips)
+    columns = columns_and_rows(count, TILE_WIDTH)[0]
     times = ",".join(f"{time:.2f}" for time in strips[0].times_s[:count])
     views = "".join(
         f"<div>{_tile(names[2 * k + j], 0, count, kind)}{text(strip.camera)}, {kind}</div>"
@@ -178,7 +178,7 @@ def _player(strips: Sequence[FrameStrip], names: Sequence[str]) -> str:
         for j, kind in enumerate(("real", "predicted"))
     )
     return (
-        f'<div data-frames="{count}" data-times="{times}"><div class="player">{views}</div>'
+        f'<div data-frames="{count}" data-columns="{columns}" data-times="{times}"><div class="player">{views}</div>'
         f'<div class="controls"><button type="button">Play</button><input type="range" min="0" max="{count - 1}" '
         f'value="0" aria-label="frame"><output>{strips[0].times_s[0]:.2f} s</output></div></div>'
     )

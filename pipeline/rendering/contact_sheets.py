@@ -17,6 +17,9 @@ Mask = NDArray[np.bool_]
 
 TILE_WIDTH = 264
 """Width of a frame in a report [px]; six fit side by side on a page of 1100 px."""
+MAX_SIDE = 4096
+"""Longest side of a picture that is placed frame by frame [px]: some browsers show a longer one, which is no texture of
+their GPU, blank."""
 SHEET_BYTES = 3_000_000
 """Maximum size of a contact sheet in a model [bytes]."""
 PNG_LEVEL = 6
@@ -101,9 +104,18 @@ def evenly(count: int, wanted: int) -> list[int]:
     return [int(k) for k in np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))]
 
 
+def columns_and_rows(count: int, width: int) -> tuple[int, int]:
+    """Return how `sprite` arranges frames: in as few rows as keep it at most `MAX_SIDE` wide."""
+    columns = max(1, min(count, MAX_SIDE // width))
+    return columns, -(-count // columns)
+
+
 def sprite(frames: Image) -> Image:
-    """Concatenate frames (T, H, W, 3) side by side to an image (H, T W, 3)."""
-    return np.concatenate(list(frames), axis=1)
+    """Arrange frames (T, H, W, 3) in rows without gutters; the last row may end black."""
+    count, height, width = frames.shape[:3]
+    columns, rows = columns_and_rows(count, width)
+    filled = np.concatenate([frames, np.zeros((rows * columns - count, height, width, 3), np.uint8)])
+    return filled.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
 
 
 def contact_sheet(rows: Sequence[Image], gutter: int = 4) -> Image:

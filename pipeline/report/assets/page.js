@@ -1,13 +1,14 @@
 for (const player of document.querySelectorAll("[data-frames]")) {
   const count = Number(player.dataset.frames), slider = player.querySelector("input");
   const times = player.dataset.times.split(","), label = player.querySelector("output");
-  const button = player.querySelector("button");
+  const button = player.querySelector("button"), columns = Number(player.dataset.columns);
+  const place = (k, of) => (of > 1 ? 100 * k / (of - 1) : 0) + "% ";
   let timer = null;
   const show = k => {
     slider.value = k;
     label.textContent = times[k] + " s";
     for (const tile of player.querySelectorAll(".tile"))
-      tile.style.backgroundPosition = (count > 1 ? 100 * k / (count - 1) : 0) + "% 0";
+      tile.style.backgroundPosition = place(k % columns, columns) + place(Math.floor(k / columns), Math.ceil(count / columns));
   };
   const stop = () => { clearInterval(timer); timer = null; button.textContent = "Play"; };
   slider.addEventListener("input", () => { stop(); show(Number(slider.value)); });

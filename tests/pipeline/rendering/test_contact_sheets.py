@@ -1,16 +1,21 @@
 """Pictures of reports: colours of masks, the window in which an object moves, outlines, and small files."""
 
 import base64
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from cgwm.pipeline.demo.episode_section import _tile
 from cgwm.pipeline.rendering.contact_sheets import (
+    MAX_SIDE,
+    TILE_WIDTH,
     FrameStrip,
     _outline,
     _window,
+    columns_and_rows,
     compared,
     depth_colors,
     jpeg_uri,
@@ -18,6 +23,7 @@ from cgwm.pipeline.rendering.contact_sheets import (
     png_uri,
     separated,
     small_png,
+    sprite,
     telling,
     tiles,
 )
@@ -47,6 +53,22 @@ def test_an_outline_lies_on_the_edge_of_the_mask() -> None:
     drawn = frame.sum(-1) > 0
     assert drawn[20, 20:40].all() and drawn[20:40, 39].all()
     assert not drawn[23:37, 23:37].any() and not drawn[:17].any()
+
+
+@pytest.mark.parametrize("count", [1, 15, 32])
+def test_many_frames_fit_into_a_texture_and_each_is_shown_at_its_place(count: int) -> None:
+    frames = np.broadcast_to(np.arange(count, dtype=np.uint8)[:, None, None, None], (count, 198, TILE_WIDTH, 3))
+    picture, (columns, rows) = sprite(frames), columns_and_rows(count, TILE_WIDTH)
+    assert max(picture.shape) <= MAX_SIDE
+    for frame in range(count):
+        found = re.search(r"position:([0-9.]+)% ([0-9.]+)%", _tile("f0", frame, count, "real"))
+        assert found is not None
+        # as browsers place a picture of so many tiles: 0 % is its first one, 100 % its last
+        across, down = (
+            round(float(share) / 100 * (of - 1)) for share, of in zip(found.groups(), (columns, rows), strict=True)
+        )
+        shown = picture[198 * down : 198 * (down + 1), TILE_WIDTH * across : TILE_WIDTH * (across + 1)]
+        assert shown.shape == (198, TILE_WIDTH, 3) and (shown == frame).all()
 
 
 def test_a_small_picture_keeps_its_brightness() -> None:
