@@ -101,7 +101,7 @@ def fit_first_contacts(
     residuals = window_residuals(world, episodes, names, noise, None if whole_flight else LEAD_FRAMES, after_s)
     coordinates = torch.tensor([parameter.encode(value) for parameter, value in start]).to(world.gravity)
     solution = solved_windows(residuals, coordinates, None, _prior(names, count, world.gravity))
-    covariance = _covariance(solution, residuals)
+    covariance = _covariance(solution, residuals, whole_flight)
     std_errors = np.sqrt(np.diag(covariance))[:count]
     found, coordinates = names[:count], solution.shared[:count]
     record = {"windows": len(residuals.observations.names), "costs": solution.costs, "converged": solution.converged}
@@ -179,10 +179,13 @@ def solved_windows(
     )
 
 
-def _covariance(solution: Solution, residuals: TrajectoryResiduals) -> Array:
-    """Return the covariance (P, P) of fitted coordinates; with few episodes at least that from the residuals."""
+def _covariance(solution: Solution, residuals: TrajectoryResiduals, whole_flight: bool) -> Array:
+    """Return the covariance (P, P) of fitted coordinates; with few episodes at least that from the residuals.
+
+    So it is with whole flights, however many, whose length makes the noise small beside what the contact law misses.
+    """
     covariance = few_covariance(solution.information.numpy(), solution.scores.numpy())
-    if len(residuals.observations.names) >= ENOUGH_EPISODES:
+    if len(residuals.observations.names) >= ENOUGH_EPISODES and not whole_flight:
         return covariance
     factor, dof = error_factor(residuals, solution)
     missed = factor * (student_quantile(0.975, dof) / REACH) ** 2 * inverse(solution.information.numpy())

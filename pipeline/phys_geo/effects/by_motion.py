@@ -60,7 +60,7 @@ def fit_effect_flights(
         groups: Session of each episode that belongs to one.
 
     Returns:
-        The estimate; None if there are no flights, or they do not identify all parameters.
+        The estimate of the effects of which flights identify all parameters; None if there are none, or no flights.
     """
     prepared = prepare(world, episodes, noise)
     if prepared.flight is None:
@@ -96,8 +96,12 @@ def fit_effect_flights(
         std = np.sqrt(np.diag(covariance))
     share = SEGMENT_THRESHOLDS.preparation.unobservable_share
     # of effects that do the same, rounding leaves no variance at all
-    if not all(s <= share * p.prior[1] for s, p in zip(std, names, strict=True)):
+    effect_of = [p.name.partition(".")[0] for p in names]
+    unseen = {e for e, s, p in zip(effect_of, std, names, strict=True) if not s <= share * p.prior[1]}
+    kept = [k for k, effect in enumerate(effect_of) if effect not in unseen]
+    if not kept:
         return None
+    names, values, std, covariance = [names[k] for k in kept], values[kept], std[kept], covariance[np.ix_(kept, kept)]
     parameters = tuple(fitted_parameter(p, float(z), float(s)) for p, z, s in zip(names, values, std, strict=True))
     record = {"flights": len(prepared.flight.items), "costs": [found.cost], "chi2": excess}
     if beside is not None:

@@ -84,12 +84,13 @@ class _Progress:
     def with_flights(
         self, episodes: Episodes, names: Sequence[str], noise: Noise, groups: Mapping[str, str]
     ) -> _Progress:
-        """Add the effects that act in flight, if flights identify all of them."""
+        """Add the effects that flights identify."""
         flown = _best(self.world, names, lambda at, wanted: fit_effect_flights(at, episodes, wanted, noise, groups))
         if flown is None:
             return self
         # these estimates are final: in contact the errors of the contact law would bias them
-        missing = [name for name in self.missing if name not in names]
+        identified = {parameter.name.partition(".")[0] for parameter in flown.parameters}
+        missing = [name for name in self.missing if name not in identified]
         return replace(self, world=flown.world, missing=missing, parts=self.parts | {"in_flight": flown})
 
     def with_contacts(self, episodes: Episodes, contact: Sequence[str], noise: Noise) -> _Progress:

@@ -251,9 +251,12 @@ def test_what_flights_show_stands_beside_effects_of_contact(monkeypatch: pytest.
     assert beside.parameters[0] == alone.parameters[0]
 
 
-def test_flights_that_do_not_show_an_effect_give_nothing() -> None:
-    """Without orientations nothing tells of a spin."""
+def test_flights_that_do_not_show_an_effect_give_nothing_of_it() -> None:
+    """Without orientations nothing tells of a spin, and a drag is found all the same."""
     episodes = [(name, {"box": replace(t["box"], quat_wxyz=None)}) for name, t in thrown(boxes(), 3)]
+    both = replace(boxes(), effects=(active("spin_damping"), active("linear_drag")))
+    told = fit_effect_flights(both, episodes, [(p, 0.5) for p in effect_parameters(both)], (5e-4, 1e-3))
+    assert told is not None and [p.name for p in told.parameters] == ["linear_drag.c"]
     world = replace(boxes(), effects=(active("spin_damping"),))
     wanted = [(parameter, 0.5) for parameter in effect_parameters(world)]
     assert fit_effect_flights(world, episodes, wanted, (5e-4, 1e-3)) is None
