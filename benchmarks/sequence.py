@@ -52,7 +52,17 @@ from render_results import record
 from store import ROOT, Store, commit_of_tree, timed
 
 Stage = Literal[
-    "development", "report1", "report2", "report3", "report4", "report5", "report6", "report7", "report8", "report9"
+    "development",
+    "report1",
+    "report2",
+    "report3",
+    "report4",
+    "report5",
+    "report6",
+    "report7",
+    "report8",
+    "report9",
+    "report10",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Each report stage is read once, after everything is fixed; the next run takes the next one."""
