@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cgwm.pipeline.optimization.importance_sampling import _moments
 from cgwm.pipeline.optimization.tails import chi2_tail, f_tail, normal_tail, student_quantile, student_tail
-from cgwm.pipeline.optimization.uncertainty import correlation_of
+from cgwm.pipeline.optimization.uncertainty import correlation_of, scaled_pinv
 from scipy import stats
 
 
@@ -39,3 +39,10 @@ def test_moments_of_weighted_samples() -> None:
     mean, covariance = _moments(samples, weight)
     assert mean == pytest.approx(np.average(samples, axis=0, weights=weight))
     assert covariance == pytest.approx(np.cov(samples.T, aweights=weight, ddof=0))
+
+
+def test_an_inverse_does_not_depend_on_the_units_of_the_parameters() -> None:
+    matrix, units = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.0]]), np.diag([1e-12, 1.0, 1e9])
+    expected = np.zeros((3, 3))
+    expected[:2, :2] = np.linalg.inv(units[:2, :2] @ matrix[:2, :2] @ units[:2, :2])
+    np.testing.assert_allclose(scaled_pinv(units @ matrix @ units), expected, rtol=1e-12)  # what nothing tells stays 0

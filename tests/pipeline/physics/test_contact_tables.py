@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.physics import simulate
+from cgwm.pipeline.physics.body import Body
 from cgwm.pipeline.physics.contact_detection import slot_count
 from cgwm.pipeline.physics.contact_law import Touch
+from cgwm.pipeline.physics.fused.packing import _hull_rows, _hulls, pack
+from cgwm.pipeline.physics.fused.structure import MOTION_COLUMNS
 from cgwm.pipeline.physics.hull import _thickness
 from cgwm.pipeline.physics.model_world import _with_only_law
 from cgwm.pipeline.physics.paper_law import PaperLaw, clamped, creep_speed, paper_impulses, rest_penetration
 from cgwm.pipeline.physics.patch import LEAST_CARRIED, _carried
+from cgwm.pipeline.physics.rollout_cost import _CALL_S, rollout_seconds
+from cgwm.pipeline.physics.smooth_distance import log_sum_exp_distance
 from cgwm.pipeline.physics.surfaces.thin_walls import _after_fall, _half_thickness, _way_through, walls
 from cgwm.pipeline.physics.world import pair_of
 from helpers import fixed_surfaces as fixed
@@ -175,3 +180,43 @@ def test_the_published_clamp_is_the_distance_outside_and_its_depth_inside() -> N
     weight = 1 / (1 + torch.exp(-200.0 * distance))
     torch.testing.assert_close(found, weight * distance + (1 - weight) * -0.01)
     assert float(found[0]) == pytest.approx(-0.01) and float(found[-1]) == pytest.approx(0.5)
+
+
+def test_rows_of_a_hull_begin_after_those_of_the_body_before() -> None:
+    bodies = [replace(plate_body((0.05, 0.04, 0.01 + 0.01 * k)), name=f"p{k}") for k in range(3)]
+    world = world_of(*bodies)
+    first = sum(body.radii.shape[-1] for body in bodies)
+    rows = [sum(part.shape[1] for part in _hull_rows(body)) for body in bodies]
+    assert min(rows) > 40
+    assert [row for row, *_ in _hulls(world)] == [first, first + rows[0], first + rows[0] + rows[1]]
+
+
+def test_one_free_body_above_the_ground_goes_into_vectors_and_carries_its_motion() -> None:
+    def structure(*bodies: Body, **more: object):
+        world = replace(world_of(*bodies), **more)
+        state = state_of(*[((k, 0, 1.0), (1, 0, 0, 0), (0, 0, 0), (0, 0, 0)) for k in range(len(bodies))])
+        return pack(world, state, times(0.1), {}, False).structure
+
+    one = structure(ball_body())
+    assert one.widens
+    assert not structure(ball_body(), ball_body(name="other")).widens
+    assert not replace(one, lanes=2).widens and not replace(one, record=True).widens
+    # the time, the motion, an impulse of three numbers, and whether it begins
+    assert one.carried_width == 1 + MOTION_COLUMNS + 3 + 1
+    assert structure(box_body()).carried_width == 1 + MOTION_COLUMNS + 3 * 8 + 1
+    assert replace(structure(box_body()), lanes=4).carried_width == 1 + MOTION_COLUMNS + 3 * 2 + 1
+
+
+def test_rollouts_together_save_their_calls_and_no_more() -> None:
+    world = world_of(ball_body(), step_s=0.01)
+    each, together = rollout_seconds(world, 50, 2.0), rollout_seconds(world, 50, 2.0, at_once=50)
+    assert each - together == pytest.approx(200 * 49 * _CALL_S, rel=1e-9)
+    assert rollout_seconds(world, 100, 2.0, at_once=100) - together == pytest.approx(together - 200 * _CALL_S, rel=1e-9)
+
+
+def test_the_smooth_minimum_of_the_paper_is_over_the_last_dimension() -> None:
+    distances = np.random.default_rng(1).uniform(0.0, 0.1, (2, 3, 4))
+    found, weights = log_sum_exp_distance(torch.from_numpy(distances), 200.0)
+    expected = -np.log(np.exp(-200.0 * distances).sum(-1)) / 200.0
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12)
+    np.testing.assert_allclose(weights.numpy(), np.exp(-200.0 * (distances - expected[..., None])), rtol=1e-10)

@@ -52,3 +52,13 @@ def _ssim(a: np.ndarray, b: np.ndarray, row: int, column: int, half: int) -> flo
         top = (2 * mx * my + 0.01**2) * (2 * xy + 0.03**2)
         values.append(top / ((mx**2 + my**2 + 0.01**2) * (xx + yy + 0.03**2)))
     return float(np.mean(values))
+
+
+def test_the_loss_of_one_pixel_is_its_own_and_little_weight_counts_little() -> None:
+    image, target = torch.rand(2, 9, 9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    one = torch.zeros(9, 9, dtype=torch.float64)
+    one[4, 3] = 1.0
+    alone = 0.2 * 0.5 * (1 - ssim_map(image, target)[4, 3]) + 0.8 * (image - target)[4, 3].abs().mean()
+    assert photometric(image, target, one).item() == pytest.approx(alone.item(), rel=1e-12)
+    assert photometric(image, target, 3 * one).item() == pytest.approx(alone.item(), rel=1e-12)
+    assert photometric(image, target, 0.5 * one).item() == pytest.approx(0.5 * alone.item(), rel=1e-12)

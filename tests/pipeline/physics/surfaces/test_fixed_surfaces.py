@@ -10,12 +10,13 @@ import pytest
 import torch
 from cgwm.pipeline.physics import engine, simulate
 from cgwm.pipeline.physics.contact_detection import Placed
-from cgwm.pipeline.physics.surfaces.detection import all_surface_points
+from cgwm.pipeline.physics.surfaces.detection import MOST_GAP_M, all_surface_points, near_surface, surface_gap
 from cgwm.pipeline.physics.surfaces.fixed_surface import FixedSurface
+from cgwm.pipeline.physics.surfaces.mesh_topology import Topology
 from cgwm.pipeline.physics.surfaces.surface_mesh import _closest
 from cgwm.schemas import InputDataError
 from helpers import fixed_surfaces as fixed
-from helpers.worlds import F64, ball_body, law, state_of, times, world_of
+from helpers.worlds import F64, ball_body, box_body, law, state_of, times, world_of
 
 LEVEL = ((1, 0, 0, 0), (0, 0, 0), (0, 0, 0))
 
@@ -176,3 +177,37 @@ def test_the_nearest_place_of_a_triangle_is_on_it_and_nothing_of_it_is_nearer() 
     shares = torch.stack((1 - first.sqrt(), first.sqrt() * (1 - second), first.sqrt() * second), -1)
     others = (points[:, None, None] - shares @ corners).norm(dim=-1).amin(-1)
     assert bool((offset.norm(dim=-1) <= others + 1e-12).all())
+
+
+def test_pseudonormals_of_a_closed_mesh_point_outwards_and_borders_have_none() -> None:
+    vertices, faces = (np.asarray(part) for part in fixed.box_mesh((0.1, 0.2, 0.3)))
+    closed = Topology.of(vertices, faces, solid=True, name="box")
+    middle = closed.corners.mean((0, 1))
+    corners = closed.corners - middle
+    places = np.concatenate((corners.mean(1)[:, None], 0.5 * (corners + np.roll(corners, -1, 1)), corners), 1)
+    assert ((places * closed.pseudonormals).sum(-1) > 0.05).all()
+    # the angles of a side about a vertex: all around within it, half of that at an edge, a quarter at a corner
+    sides = (np.abs(places[:, 4:]) > np.array([0.1, 0.2, 0.3]) - 1e-9).astype(float)
+    angles = 4 * np.pi / 2 ** sides.sum(-1, keepdims=True)
+    np.testing.assert_allclose(closed.pseudonormals[:, 4:], angles * sides * np.sign(places[:, 4:]), atol=1e-9)
+    open_ = Topology.of(vertices, faces[2:], solid=False, name="open")  # two neighbouring triangles are missing
+    gone = {tuple(vertices[k]) for k in faces[:2].reshape(-1)}
+    border = np.array([[tuple(corner) in gone for corner in corners] for corners in open_.corners])
+    assert border.any() and not border.all()
+    np.testing.assert_array_equal((open_.pseudonormals[:, 4:] == 0).all(-1), border)
+
+
+def test_a_body_nears_a_surface_by_its_speed_and_by_its_spin() -> None:
+    plane, body, step = fixed.half_space(), box_body(), torch.tensor([0.01], dtype=F64)
+    reach = float((body.centers[0].norm(dim=-1) + body.radii[0]).max())
+    turn, still = torch.eye(3, dtype=F64)[None], torch.zeros(1, 3, dtype=F64)
+
+    def near(above_m: float, speed_m_s: float, spin_rad_s: float) -> bool:
+        place = torch.tensor([[0.0, 0.0, reach + above_m]], dtype=F64)
+        moving = (torch.tensor([[v, 0.0, 0.0]], dtype=F64) for v in (speed_m_s, spin_rad_s))
+        return near_surface(Placed(body, place, turn, *moving), plane, step) is not None
+
+    assert near(0.015, 2.0, 0.0) and not near(0.025, 2.0, 0.0)
+    assert near(0.015 + 0.01 * 10 * reach, 2.0, 10.0) and not near(0.025 + 0.01 * 10 * reach, 2.0, 10.0)
+    far = Placed(body, torch.tensor([[0.0, 0.0, 2 * MOST_GAP_M + 1]], dtype=F64), turn, still, still)
+    assert surface_gap(far, plane).tolist() == [math.inf]
