@@ -14,8 +14,8 @@ from ...physics.world import World
 from ...segments.candidates import Candidate, Variant, admissible, base_values, variants_of, with_variants
 from ...segments.sliding.descent import SlidingFit
 from ...segments.sliding.fit import StartedSliding, fit_sliding, noiseless_misfits, nuisance_parameters
+from ...segments.sliding.variant_fits import batches
 from ..thresholds import THRESHOLDS
-from .sliding import batches
 
 
 @dataclass(frozen=True)

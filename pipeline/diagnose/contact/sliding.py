@@ -17,24 +17,13 @@ import torch
 
 from ...physics.effects.effect import ActiveEffect
 from ...segments.candidates import Candidate, Variant, with_variants
-from ...segments.segments import Segments
-from ...segments.sliding.descent import ITERATIONS, SlidingFit, information_by_segment
-from ...segments.sliding.fit import StartedSliding, better_starts, fit_sliding, nuisance_parameters
-from ...segments.sliding.separate_starts import separate_starts
-from ...segments.thresholds import SEGMENT_THRESHOLDS
+from ...segments.sliding.descent import SlidingFit, information_by_segment
+from ...segments.sliding.fit import StartedSliding, fit_sliding, nuisance_parameters
+from ...segments.sliding.variant_fits import fits_of_variants
 from ..evidence.evidence import Evidence
 from ..thresholds import THRESHOLDS, SlidingThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
 from .friction_pyramid import FrictionPyramid
-
-FIRST_ITERATIONS = 3
-"""Number of iterations after which fits that are far behind are not continued."""
-MOST_PASSES = 5
-"""Maximum number of continuations of the fits that are close. A slide that ends within a segment allows small steps
-only, and a fit that has not converged would lose against one that needs fewer."""
-MANY = 4
-"""Maximum number of parameters of a candidate that is fitted in a batch with smaller ones. The longest fit determines
-the time of a batch."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +53,8 @@ class SlidingTest(ContactTest):
         base, degrees = started.base, float(started.segments.dof.sum())
         if base.cost - (degrees - self.limits.surplus_sigmas * math.sqrt(2 * degrees)) < self.limits.score_sure:
             return []
-        found = _fits(variants, started, self.limits)
+        limits = self.limits
+        found = fits_of_variants(variants, started, limits.score_sure, limits.close_share, limits.converged)
         # the model alone, fitted again from the states of the best candidate: what both gain is no sign of an effect
         _, best = min(found, key=lambda one: one[1].cost)
         again = (best.segments, best.values[0, : base.values.shape[1]])
@@ -182,90 +172,6 @@ def pyramid_share(started: StartedSliding, variant: Variant, fit: SlidingFit, ba
     own = fit.values[0, : fit.values.shape[1] - len(variant.parameters)]
     found = fit_sliding(world, [], [(fit.segments.in_world(world), own)], started.flight_parameters)[0]
     return (base - found.cost) / max(base - fit.cost, 1e-9)
-
-
-def _fits(
-    variants: Sequence[Variant], started: StartedSliding, thresholds: SlidingThresholds
-) -> list[tuple[Variant, SlidingFit]]:
-    """Return the fit of each variant; those that are far behind after the first iterations do not converge.
-
-    Args:
-        variants: The variants.
-        started: The sliding segments and their fit without the variants.
-        thresholds: The smallest score of interest, and which fits are far behind.
-    """
-    soft_world, base, known = started.segments.world, started.base, started.flight_parameters
-    found: dict[int, tuple[Variant, SlidingFit]] = {}
-    for part in batches(variants):
-        tried = fit_sliding(soft_world, part, _starts(part, started), known, FIRST_ITERATIONS)
-        found |= {len(found) + k: one for k, one in enumerate(zip(part, tried, strict=True))}
-    found = _continued(found, started, FIRST_ITERATIONS)
-    gains = {k: base.cost - fit.cost for k, (_, fit) in found.items()}
-    least = thresholds.close_share * max(gains.values())
-    close = {k: found[k] for k, gain in gains.items() if gain > thresholds.score_sure and gain > least}
-    for _ in range(MOST_PASSES):
-        again = _continued(close, started, ITERATIONS)
-        found |= again
-        fell = [k for k in close if close[k][1].cost - again[k][1].cost > thresholds.converged]
-        close = {k: again[k] for k in fell if len(again[k][0].parameters) <= MANY}
-    return list(found.values())
-
-
-def _starts(part: Sequence[Variant], started: StartedSliding) -> list[tuple[Segments, torch.Tensor]]:
-    """Return where the fits of variants start: at the fit without them, or nearer where that one stalled."""
-    base = started.base
-    known = [(base.segments, base.values[0])] * len(part)
-    if base.cost < SEGMENT_THRESHOLDS.sliding_data.well_fitted * float(started.segments.dof.sum()):
-        return known
-    separate = {
-        id(v): one
-        for some in batches(part, alike=False)
-        for v, one in zip(some, separate_starts(started, some), strict=True)
-    }
-    found = (separate[id(variant)] for variant in part)
-    return [one[:2] if one[2] < base.cost else other for one, other in zip(found, known, strict=True)]
-
-
-def _continued(
-    some: dict[int, tuple[Variant, SlidingFit]], started: StartedSliding, iterations: int
-) -> dict[int, tuple[Variant, SlidingFit]]:
-    """Return fits of variants continued from better starts, by the same keys."""
-    world, known = started.segments.world, started.flight_parameters
-    done: dict[int, tuple[Variant, SlidingFit]] = {}
-    for part in batches([variant for variant, _ in some.values()]):
-        mine = {k: fit for k, (variant, fit) in some.items() if any(variant is one for one in part)}
-        many = len(part[0].parameters) > MANY
-        plain = [(fit.segments, fit.values[0]) for fit in mine.values()]
-        starts = plain if many else better_starts(world, part, list(mine.values()), known)
-        again = fit_sliding(world, part, starts, known, iterations)
-        done |= {k: (variant, fit) for k, variant, fit in zip(mine, part, again, strict=True)}
-    return done
-
-
-def batches(variants: Sequence[Variant], alike: bool = True) -> list[list[Variant]]:
-    """Split variants into batches that are computed at once, in order.
-
-    The fused kernel takes one effect of a kind; variants of many parameters slow a batch down and are kept apart.
-
-    Args:
-        variants: The variants.
-        alike: Whether a batch may have a candidate with several values of its constants, one for each item.
-    """
-    parts: list[list[Variant]] = []
-    for variant in variants:
-        part = next((part for part in parts if all(_go_together(one, variant, alike) for one in part)), None)
-        if part is None:
-            parts.append([variant])
-        else:
-            part.append(variant)
-    return parts
-
-
-def _go_together(one: Variant, other: Variant, alike: bool) -> bool:
-    """Return whether two variants may be in one batch."""
-    if (len(one.parameters) > MANY) != (len(other.parameters) > MANY):
-        return False
-    return type(one.active.effect) is not type(other.active.effect) or (alike and one.place == other.place)
 
 
 def _judged(

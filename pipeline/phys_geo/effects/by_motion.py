@@ -14,12 +14,12 @@ import numpy as np
 import torch
 
 from ....datasets.capture.tracks import Episode
-from ...optimization.uncertainty import correlation_of, few_covariance
+from ...optimization.uncertainty import REACH, correlation_of, few_covariance
 from ...physics.contact_law import ContactLaw
 from ...physics.effects import Effect
 from ...physics.parameters import DAMPING_RATIO, FRICTION, Parameter
 from ...physics.world import World
-from ...segments.candidates import base_values
+from ...segments.candidates import Candidate, base_values, variants_of
 from ...segments.first_contact_fit import EffectEstimate, placed
 from ...segments.fitted_parameters import fitted_parameter
 from ...segments.flights.shaped_errors import no_narrower
@@ -29,14 +29,20 @@ from ...segments.impacts.velocities import measured_impacts
 from ...segments.prepare import Prepared, prepare
 from ...segments.segment_fit import projected, refit
 from ...segments.session_spread import beside_sessions
-from ...segments.sliding.descent import information_by_segment
+from ...segments.sliding.descent import SlidingFit, information_by_segment
 from ...segments.sliding.fit import StartedSliding, contact_effect_parameters, fit_sliding, nuisance_parameters
+from ...segments.sliding.variant_fits import fits_of_variants
 from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ...trajectories.track_noise import Noise
-from .identified_effects import at_neutral, identified_effects
+from .identified_effects import at_neutral, identified_effects, with_constants
 
 ITERATIONS = 25
 """Maximum number of steps in a fit to flights."""
+CLOSE_SHARE, CONVERGED = 0.3, 3.0
+"""Of slides, as in a diagnosis: share of the largest fall of chi2 from which on a constant's value is followed, and the
+fall in a pass of steps below which a fit has converged."""
+UNTOLD = REACH**2
+"""Difference of chi2, in units of that of a degree of freedom, below which two fits to slides are not told apart."""
 
 
 def fit_effect_flights(
@@ -150,9 +156,60 @@ class SlidingStart:
         """
         known, base = self.started.flight_parameters, self.started.base
         neutral = replace(base.segments.world, effects=at_neutral(world, names).effects)
-        parameters = nuisance_parameters(neutral, known)
         start = base.values[0, :2]  # friction and height; the effects are neutral
         found = fit_sliding(neutral, [], [(base.segments, start)], known)[0]
+        return self._estimate(world, names, neutral, found)
+
+    def fit_one(self, world: World, name: str) -> EffectEstimate:
+        """Fit one effect at all values of its constants, and return the best one.
+
+        It is fitted as `cgwm diagnose` does: the minima of a friction that falls with the slip and of one that rises
+        with it are apart, and along their valleys steps stall.
+
+        Args:
+            world: World with the effect, and possibly others.
+            name: Name of the effect.
+        """
+        base = self.started.base
+        effect = next(active.effect for active in world.effects if active.effect.name == name)
+        variants = variants_of([Candidate(name, effect)], world.gravity[0, :1])
+        fits = fits_of_variants(variants, self.started, 0.0, CLOSE_SHARE, CONVERGED)
+        variant, found = min(fits, key=lambda one: one[1].cost)
+        constants = {f"{name}.{key}": value for key, value in variant.constants.items()}
+        chosen = with_constants(world, constants)
+        neutral = replace(base.segments.world, effects=at_neutral(chosen, [name]).effects)
+        parameters = nuisance_parameters(neutral, self.started.flight_parameters)
+        bare = nuisance_parameters(base.segments.world, self.started.flight_parameters)
+        order = [p.name for p in bare] + [p.name for p in parameters if p.name.partition(".")[0] == name]
+        places = [order.index(p.name) for p in parameters]
+        excess = max(found.cost / float(found.segments.dof.sum()), 1.0)
+        alike = [fit.values[:, places] for _, fit in fits if fit.cost - found.cost < UNTOLD * excess]
+        found = replace(found, values=found.values[:, places])
+        apart = (torch.cat(alike) - found.values).abs().amax(0).numpy()
+        estimate = self._estimate(chosen, [name], neutral, found, apart)
+        record = dict(estimate.record)
+        if constants:
+            tried = [
+                {f"{name}.{key}": value for key, value in one.constants.items()} | {"cost": fit.cost}
+                for one, fit in fits
+            ]
+            record["constants_tried"] = tried
+        return replace(estimate, constants=constants, record=record)
+
+    def _estimate(
+        self, world: World, names: Sequence[str], neutral: World, found: SlidingFit, apart: np.ndarray | None = None
+    ) -> EffectEstimate:
+        """Return the estimate of effects from their fit.
+
+        Args:
+            world: World with the effects.
+            names: Names of the effects.
+            neutral: World of the segments with the effects at neutral.
+            found: The fit, of the parameters of `nuisance_parameters`.
+            apart: How far each value is from those of other minima that the slides do not tell from this one.
+        """
+        known, base = self.started.flight_parameters, self.started.base
+        parameters = nuisance_parameters(neutral, known)
         sliding = found.segments.in_world(neutral)
         information, score = information_by_segment(sliding, parameters, found.values[0])
         # no prior on the friction: its start comes from the same segments, and would decide about similar effects
@@ -175,6 +232,7 @@ class SlidingStart:
             score,
             excess,
             record,
+            apart,
         )
         return replace(estimate, contact_start={FRICTION.name: friction})
 

@@ -6,10 +6,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import torch
-
 from ....datasets.capture.tracks import Episode
-from ...physics.effects import ActiveEffect
 from ...physics.parameters import GROUND_SHIFT, Parameter, effect_parameters
 from ...physics.world import World
 from ...segments.candidates import without_effects
@@ -18,6 +15,7 @@ from ...segments.prepare import Prepared, prepare
 from ...segments.random_effects import fit_random_effects
 from ...trajectories.track_noise import Noise
 from .by_motion import ImpactStart, SlidingStart, fit_effect_flights
+from .identified_effects import with_constants
 
 Start = list[tuple[Parameter, float]]
 """Parameters of effects, and their start."""
@@ -109,7 +107,10 @@ class _Progress:
         motion = kind.of(prepared, without_effects(self.world, *names)) if names else None
         if motion is None:
             return self
-        found = _best_of(self.world, names, lambda at, _: motion.fit(at, names))
+        if len(names) == 1 and isinstance(motion, SlidingStart):
+            found = motion.fit_one(self.world, names[0])
+        else:
+            found = _best_of(self.world, names, lambda at, _: motion.fit(at, names))
         identified = {parameter.name.partition(".")[0] for parameter in found.parameters}
         if not identified:
             return self
@@ -176,7 +177,7 @@ def _best(
     grids = _grids(world, names)
     found: list[EffectEstimate] = []
     for chosen in grids:
-        at = _at(world, chosen)
+        at = with_constants(world, chosen)
         one = fit(at, _starts(at, names))
         if one is None:
             return None
@@ -188,7 +189,7 @@ def _best_of(world: World, names: Sequence[str], fit: Callable[[World, Start], E
     """Return the fit of effects with the best values of their constants, for a fit that never returns None."""
     found: list[EffectEstimate] = []
     for chosen in _grids(world, names):
-        at = _at(world, chosen)
+        at = with_constants(world, chosen)
         found.append(replace(fit(at, _starts(at, names)), constants=chosen))
     return _lowest(found)
 
@@ -231,14 +232,3 @@ def _starts(world: World, names: Sequence[str]) -> Start:
             start = parameter.scale if neutral and parameter.nonnegative else value
             starts.append((found[f"{active.effect.name}.{parameter.name}"], start))
     return starts
-
-
-def _at(world: World, constants: Mapping[str, float]) -> World:
-    """Return the world with constants of its effects, `effect.constant` by name."""
-    effects = []
-    for active in world.effects:
-        given = {c.name: constants.get(f"{active.effect.name}.{c.name}") for c in active.effect.constants}
-        chosen = {name: value for name, value in given.items() if value is not None}
-        like = next(iter(active.values.values()), torch.zeros(1))
-        effects.append(ActiveEffect.of(active.effect, active.values | chosen, like))
-    return replace(world, effects=tuple(effects))

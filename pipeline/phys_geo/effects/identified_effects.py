@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from ...optimization.uncertainty import correlation_of, few_covariance
+from ...optimization.uncertainty import REACH, correlation_of, few_covariance
 from ...physics.effects import ActiveEffect
 from ...physics.parameters import Parameter
 from ...physics.world import World
@@ -33,6 +34,7 @@ def identified_effects(
     score: Tensor,
     excess: float,
     record: dict[str, Any],
+    apart: np.ndarray | None = None,
 ) -> EffectEstimate:
     """Keep the effects of which the data identify at least one parameter.
 
@@ -49,12 +51,16 @@ def identified_effects(
             to all frames of a segment.
         excess: Ratio of the variance of the residuals to that of the noise.
         record: Course of the fit, for `fit.json`.
+        apart: How far each value (P,) is from those of other minima that the data do not tell from this one.
     """
     effect_of = [p.name.partition(".")[0] for p in parameters]
     prior_information = np.diag(prior.numpy())
     covariance = few_covariance(
         information.numpy() / excess + prior_information, score.numpy() / excess, prior_information
     )
+    if apart is not None:  # an interval holds the other minima, too
+        wider = 1 + apart / (REACH * np.sqrt(np.diag(covariance)))
+        covariance = covariance * np.outer(wider, wider)
     std = np.sqrt(np.diag(covariance))
     known = std < SEGMENT_THRESHOLDS.preparation.unobservable_share * np.array([p.prior[1] for p in parameters])
     identified = {name for name, yes in zip(effect_of, known, strict=True) if yes and name in names}
@@ -76,3 +82,14 @@ def _neutral(active: ActiveEffect) -> ActiveEffect:
     """Return an effect with neutral parameters and its constants."""
     constants = {c.name: active.values[c.name] for c in active.effect.constants}
     return ActiveEffect.of(active.effect, constants, next(iter(active.values.values())))
+
+
+def with_constants(world: World, constants: Mapping[str, float]) -> World:
+    """Return the world with constants of its effects, `effect.constant` by name."""
+    effects = []
+    for active in world.effects:
+        given = {c.name: constants.get(f"{active.effect.name}.{c.name}") for c in active.effect.constants}
+        chosen = {name: value for name, value in given.items() if value is not None}
+        like = next(iter(active.values.values()), torch.zeros(1))
+        effects.append(ActiveEffect.of(active.effect, active.values | chosen, like))
+    return replace(world, effects=tuple(effects))
