@@ -35,6 +35,7 @@ from .photos import Inputs
 from .pose_posterior import principal_points
 from .reconstruction import SfmModel, VerifiedPair
 from .track_alignment import aligned
+from .turned_on_the_spot import turned_on_the_spot
 from .turntable_cameras import TurntableCameras, on_turntable
 from .turntable_motion import TurntableMotion
 
@@ -115,6 +116,12 @@ def search(folder: Path, inputs: Inputs, config: CalibrateConfig) -> tuple[Candi
     best = max(passed, key=lambda candidate: _rank(candidate, inputs), default=None)
     if best is None or photo_count(best.model, inputs) < _needed(inputs):
         raise _not_converged(inputs, attempts, best, last)
+    if turned_on_the_spot(best.model, best.pairs):
+        raise NotConvergedError(
+            "The photos were taken from one place: turns of the camera alone explain all matches, and tell no depth.",
+            "photos from many places around the object.",
+            "walk around the object, or turn it before the camera on a turntable; turning on the spot shows nothing.",
+        )
     attempts[best.attempt] = attempts[best.attempt].model_copy(update={"outcome": "taken"})
     return best, attempts
 
