@@ -15,7 +15,7 @@ from cgwm.pipeline.segments import segments as segments_module
 from cgwm.pipeline.segments.first_contact_fit import MAX_WINDOWS, _prior, windows_of
 from cgwm.pipeline.segments.held_out_gain import HeldOutGain
 from cgwm.pipeline.segments.prepare import LIMITS as PREPARE_LIMITS
-from cgwm.pipeline.segments.prepare import Prepared
+from cgwm.pipeline.segments.prepare import Prepared, _outlier_warnings
 from cgwm.pipeline.segments.segment_fit import Linear, Refit, robust_excess
 from cgwm.pipeline.segments.segments import Segments, _line
 from cgwm.pipeline.trajectories.observations import Observations
@@ -210,3 +210,12 @@ def test_contact_with_a_surface_is_contact_where_there_is_no_ground() -> None:
     found = prepare_module.prepare(replace(world, surfaces=(table,)), episodes)
     assert not bare.contact_items and bare.flight is not None
     assert {item.episode for item in found.contact_items} == {0, 1} and found.flight is None
+
+
+def test_a_warning_names_the_episodes_with_the_most_wrong_measurements_first() -> None:
+    times = {"a": (0.1,), "b": (0.1, 0.2, 0.3, 0.4, 0.5), "d": (3.0,), "c": (1.0, 2.0)}
+    assert _outlier_warnings(9, times) == [
+        "9 measurements in flight are wrong and were left out: b at 0.100, 0.200, 0.300 s and 2 more; "
+        "c at 1.000, 2.000 s; a at 0.100 s; and 1 more episodes."
+    ]
+    assert _outlier_warnings(0, {}) == []

@@ -10,13 +10,25 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.physics.parameters import FRICTION
 from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.segments import release_detection
 from cgwm.pipeline.segments.impacts.bounces import LIMITS as BOUNCE
 from cgwm.pipeline.segments.impacts.bounces import BounceSide, _turns, bounces_in
 from cgwm.pipeline.segments.release_detection import LIMITS, _rotation_chi2, held_starts, without_held
-from cgwm.pipeline.segments.segment_states import _merged, _placed, _put, _searched, best_of, costs_of, fit_states
-from cgwm.pipeline.segments.segments import Segments
+from cgwm.pipeline.segments.segment_states import (
+    DRAW_SPREAD,
+    DRAWS,
+    _draws,
+    _merged,
+    _placed,
+    _put,
+    _searched,
+    best_of,
+    costs_of,
+    fit_states,
+)
+from cgwm.pipeline.segments.segments import PARAMETER_STEP, Segments
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.segmentation import Segment
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -85,6 +97,27 @@ def test_states_are_found_from_others_and_do_not_depend_on_the_other_segments() 
     placed = _placed(truth, [2, 0], far.select([2, 0])).observations.state.velocity_m_s
     torch.testing.assert_close(placed, moved(truth, [1.0, 0.0, 1.0]).velocity_m_s)
     assert _put(torch.arange(4.0), [3, 1], torch.tensor([9.0, 8.0])).tolist() == [0.0, 8.0, 2.0, 9.0]
+
+
+def test_draws_spread_by_the_noise_of_a_state_between_two_frames() -> None:
+    some = flights(2)
+    drawn = _draws(some, 3)
+    assert drawn.shape == (DRAWS, 2, 12) and torch.equal(drawn[:, 0], drawn[:, 1])
+    size = drawn[:, 0].square().mean(0).sqrt().unflatten(0, (4, 3)).square().mean(1).sqrt()
+    noise = torch.tensor([1e-3, 1e-2, 1e-3 * RATE_HZ, 1e-2 * RATE_HZ], dtype=F64)
+    torch.testing.assert_close(size, DRAW_SPREAD * noise, rtol=0.25, atol=0.0)
+    assert not torch.equal(drawn, _draws(some, 4))
+
+
+def test_a_slope_is_finite_where_a_moved_rollout_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    some = flights(2)
+    rows = some.residuals([], NONE, jacobian=False)[0]
+    drag = replace(FRICTION, prior=(0.3, 0.5))
+    beyond = torch.stack([torch.full_like(rows, torch.inf), -torch.inf * torch.ones_like(rows), rows + 1.0])
+    monkeypatch.setattr(Segments, "residuals", lambda *_, **__: (beyond.flatten(0, 1), None))
+    found = some.slopes([drag], torch.zeros(3, 1, dtype=F64), [0, 0, 0], rows)
+    assert (found[..., :2] == 0).all()
+    torch.testing.assert_close(found[..., 2], torch.full_like(rows, 1 / (PARAMETER_STEP * 0.5)))
 
 
 def test_two_frames_leave_no_degree_of_freedom() -> None:

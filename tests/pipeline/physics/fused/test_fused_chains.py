@@ -19,7 +19,7 @@ from cgwm.pipeline.physics.fused import simulate_fused, structure
 from cgwm.pipeline.physics.fused.launch import require_room
 from cgwm.pipeline.physics.fused.packing import pack, reason_against
 from cgwm.pipeline.physics.fused.rollout import roll
-from cgwm.pipeline.physics.fused.structure import SHARED_BYTES, Structure
+from cgwm.pipeline.physics.fused.structure import SHARED_BYTES, Structure, lanes_for
 from cgwm.pipeline.physics.hull import Hull
 from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.runtime import kernel_build
@@ -376,3 +376,58 @@ def test_a_row_of_the_table_is_as_wide_as_the_kernel_reads(kind: str) -> None:
     )  # fmt: skip
     packed = pack(world, still(4), times(0.01), {"base": path}, False)
     assert packed.table.shape[-1] == packed.structure.table_width
+
+
+SIZES = {
+    "of 4 threads": {"lanes": 4},
+    "of a warp": {"lanes": 32},
+    "with derivatives": {"lanes": 32, "dual": True},
+    "of float32": {"lanes": 32, "single": True},
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "environment", "block"),
+    [
+        ("three links", [4286, 13470, 26214, 7098], [34587, 13769, 26513, 7397]),
+        ("ten links", [10863, 19791, 38751, 10311], [87868, 20755, 39715, 11275]),
+        ("hand with hulls", [24714, 25122, 46314, 14074], [25408, 25816, 47008, 14768]),
+    ],
+)
+def test_environments_take_no_more_memory_than_when_it_was_last_counted(
+    name: str, environment: list[int], block: list[int]
+) -> None:
+    """The bounds hold by `check_memory` of the host kernel; larger ones would leave room for fewer environments."""
+    if name == "hand with hulls":
+        world, state, commands = hulled_hand()
+        one = replace(pack(world, state, times(0.1), commands, False).structure, crowd=64)
+    else:
+        one = long_chain(3 if name == "three links" else 10)
+    every = [replace(one, **change) for change in SIZES.values()]
+    assert [each.shared_bytes for each in every] == environment
+    assert [each.block_bytes for each in every] == block
+
+
+def test_threads_carry_motion_impulses_and_joints_and_list_their_contacts() -> None:
+    arm, (world, state, commands) = long_chain(3), hulled_hand()
+    hand = replace(pack(world, state, times(0.1), commands, False).structure, lanes=32, crowd=64)
+    assert arm.carried_width == 1 + 4 * 13 + 3 + 1 + 5 * 3  # four bodies, one contact, three joints
+    assert hand.carried_width == 1 + len(world.bodies) * 13 + 4 * 64 + 1 + 5 * sum(len(c.moving) for c in world.chains)
+    assert (replace(arm, lanes=4).carried_rows, hand.carried_rows) == (4, 1)
+    many = replace(arm, pairs=((1, -1, 33),), lanes=4)
+    assert (many.slots, many.contact_bytes, replace(many, single=True).contact_bytes) == (9, 16 * 8 * 9, 16 * 4 * 9)
+    assert not long_chain(3)._long_lists() and set(long_chain(9)._long_lists()) >= {"is_free_of", "sphere_count_of"}
+    assert {len(values) for values in long_chain(9)._long_lists().values()} == {10}
+
+
+@pytest.mark.parametrize(
+    ("contacts", "environments", "links", "lanes"),
+    [
+        (0, 1, 0, 1), (8, 1, 0, 8), (9, 1, 0, 16), (100, 1, 0, 32), (8, 10**6, 0, 2), (40, 10**6, 0, 16),
+        (40, 1, 8, 32), (40, 10**6, 8, 4), (40, 10**6, 40, 8), (2, 10**6, 2, 1), (2, 1, 3, 2),
+    ],
+)  # fmt: skip
+def test_environments_share_threads_by_their_contacts_and_number(
+    contacts: int, environments: int, links: int, lanes: int
+) -> None:
+    assert lanes_for(contacts, environments, single=False, dual=False, paired=False, links=links) == lanes

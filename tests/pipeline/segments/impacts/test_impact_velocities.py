@@ -12,7 +12,15 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_to_matrix
-from cgwm.pipeline.segments.impacts.velocities import LIMITS, _chains, _Hops, _measurable, _neighbours, _on_ground
+from cgwm.pipeline.segments.impacts.velocities import (
+    LIMITS,
+    _chains,
+    _Hops,
+    _measurable,
+    _neighbours,
+    _on_ground,
+    measured_impacts,
+)
 from cgwm.pipeline.trajectories.segmentation import Segment, whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.worlds import F64, ball_body, batch, box_body, world_of
@@ -121,6 +129,8 @@ def test_impacts_are_measured_of_one_ball_above_a_ground_with_orientation() -> N
     assert not measurable(world_of(box_body()))
     assert not measurable(world_of(ball_body(0.03), ball_body(0.03, name="other")), free=(0, 1))
     assert not measurable(world_of(ball_body(0.03), ball_body(0.03, name="other")))
+    grounded: Any = SimpleNamespace(observations=SimpleNamespace(free=(0,)), has_orientation=True, flight=None)
+    assert measured_impacts(grounded, ball) is None
 
 
 NORMAL = torch.tensor([0.6, 0.0, 0.8], dtype=F64)
