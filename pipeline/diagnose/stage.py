@@ -46,6 +46,7 @@ from ..segments.candidates import Candidate, admissible, without_effects
 from ..segments.center_of_mass import as_one_body
 from ..segments.described_motion import not_described
 from ..segments.flights.residual_wrench import Omnibus, covariates_of
+from ..segments.ground_contact import on_the_ground
 from ..segments.group_parameters import with_known_groups
 from ..segments.input_checks import check_observability, check_units_and_geometry
 from ..segments.prepare import Prepared, prepare
@@ -218,6 +219,7 @@ def report_and_findings(
             "no part of the tracks is long enough for a fit: neither flight nor contact has six frames without a gap.",
             todo="record at 60 Hz or more, or name another split.",
         )
+    world, prepared = on_the_ground(world, prepared)
     findings = find(prepared, world, library)
     _, refused = admissible(world, library, prepared.has_orientation, prepared.observations.spin_rad_s is not None)
     clear = prepared.airborne & (prepared.observations.seen.amax(-1) > 0)

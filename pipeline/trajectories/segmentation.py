@@ -212,9 +212,7 @@ def clear_frames(world: World, observations: Observations, noise: Noise) -> Tens
                 np.hypot(noise.position_m, noise.rotation_rad * size_of(world.bodies[index]))
             )
             clear &= _apart(heights, margin)
-    others = clearance(replace(world, ground_normal=None), observations)
-    if bool(torch.isfinite(others).any()):
-        clear &= _apart(others[..., None], FLIGHT_MARGIN_M + LIMITS.height_sigmas * noise.position_m)
+    clear &= clear_of_surfaces(world, observations, noise)
     for a in range(len(observations.free)):
         for b in range(a):
             if world.chains and world.chain_of(observations.free[a]) == world.chain_of(observations.free[b]) >= 0:
@@ -223,6 +221,14 @@ def clear_frames(world: World, observations: Observations, noise: Noise) -> Tens
             gap = (observations.position_m[:, :, a] - observations.position_m[:, :, b]).norm(dim=-1) - reach
             clear &= _apart(gap[..., None], FLIGHT_MARGIN_M + LIMITS.height_sigmas * noise.position_m)
     return clear
+
+
+def clear_of_surfaces(world: World, observations: Observations, noise: Noise) -> Tensor:
+    """Return the frames (B, T) surely without contact with fixed surfaces and bodies that are not free, as there."""
+    others = clearance(replace(world, ground_normal=None), observations)
+    if not bool(torch.isfinite(others).any()):
+        return torch.ones_like(others, dtype=torch.bool)
+    return _apart(others[..., None], FLIGHT_MARGIN_M + LIMITS.height_sigmas * noise.position_m)
 
 
 class GroundPlane(NamedTuple):
@@ -257,8 +263,11 @@ def heights_of(world: World, body: Body, observations: Observations, column: int
 
 
 def _apart(gaps: Tensor, margin: float) -> Tensor:
-    """Return the frames (B, T) whose gaps (B, T, N) all exceed the margin and a share of their last and next move."""
-    moves = gaps.diff(dim=1).abs()
+    """Return the frames (B, T) whose gaps (B, T, N) all exceed the margin and a share of their last and next move.
+
+    Gaps to surfaces are infinite beyond some distance; moves to and from there are not known, and do not count.
+    """
+    moves = gaps.diff(dim=1).abs().nan_to_num(nan=0.0, posinf=0.0)
     edge = torch.zeros_like(gaps[:, :1])
     move = torch.maximum(torch.cat((edge, moves), 1), torch.cat((moves, edge), 1))
     return (gaps > margin + LIMITS.move_share * move).all(-1)

@@ -13,6 +13,7 @@ from cgwm.pipeline.physics.parameters import Parameter
 from cgwm.pipeline.segments import prepare as prepare_module
 from cgwm.pipeline.segments import segments as segments_module
 from cgwm.pipeline.segments.first_contact_fit import MAX_WINDOWS, _prior, windows_of
+from cgwm.pipeline.segments.ground_contact import on_the_ground
 from cgwm.pipeline.segments.held_out_gain import HeldOutGain
 from cgwm.pipeline.segments.prepare import LIMITS as PREPARE_LIMITS
 from cgwm.pipeline.segments.prepare import Prepared, _outlier_warnings
@@ -219,3 +220,25 @@ def test_a_warning_names_the_episodes_with_the_most_wrong_measurements_first() -
         "c at 1.000, 2.000 s; a at 0.100 s; and 1 more episodes."
     ]
     assert _outlier_warnings(0, {}) == []
+
+
+def test_contact_is_that_of_the_ground_where_there_are_walls() -> None:
+    """A ball rolls towards a wall: what was measured at the wall is left out, and so is the wall."""
+    t = np.arange(100) / 120
+    x = 0.6 * t
+    noise = np.random.default_rng(0).normal(0, 1e-4, (2, len(t), 3))
+    place = np.stack([x, 0 * t, 0 * t + 0.02], 1)
+    episodes = [(f"e{k}", {"ball": Track(t, place + noise[k], None)}) for k in range(2)]
+    wall = box((0.1, 1.0, 0.3), position=(0.45, 0, 0.3))
+    world = replace(world_of(ball_body(0.02)), surfaces=(wall,))
+    prepared = prepare_module.prepare(world, episodes)
+    alone, found = on_the_ground(world, prepared)
+    assert not alone.surfaces and alone.bodies is world.bodies
+    assert 0 < len(found.contact_items) < len(prepared.contact_items)
+    assert f"{len(prepared.contact_items) - len(found.contact_items)} of" in found.warnings[-1]
+    before, after = (one.observations.seen[:, : len(t), 0] > 0 for one in (prepared, found))
+    at_wall = torch.as_tensor((x > 0.33) & (x < 0.57))
+    assert bool((before & at_wall).any()) and not bool((after & at_wall).any())
+    assert torch.equal(before[:, x < 0.32], after[:, x < 0.32])
+    plain = replace(world, surfaces=())
+    assert on_the_ground(plain, prepared) == (plain, prepared)
