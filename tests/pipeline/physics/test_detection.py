@@ -8,7 +8,7 @@ import pytest
 import torch
 from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import State, simulate
-from cgwm.pipeline.physics.contact_detection import PAIR_SMOOTHING_M, Placed, body_points
+from cgwm.pipeline.physics.contact_detection import PAIR_SMOOTHING_M, Placed, body_points, near_body
 from cgwm.pipeline.physics.smooth_distance import union_distance
 from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
 from cgwm.schemas import BoxShape, Shape
@@ -55,6 +55,22 @@ def test_all_that_touches_is_found_both_ways_with_the_smooth_distance_of_all_sph
     index = points.slot[..., None].expand(-1, -1, 3)
     torch.testing.assert_close(points.normal, normals.gather(1, index), atol=1e-9, rtol=0)
     assert bool((points.slot[:, 0] < count).all()) and int(points.slot.max()) >= count
+
+
+@pytest.mark.parametrize("spinning", [False, True])
+def test_bodies_are_near_where_speed_and_spin_may_bring_them_within_a_step(spinning: bool) -> None:
+    body, other = box_body((0.05, 0.05, 0.05)), ball_body(0.02)
+    turn, step = torch.eye(3, dtype=F64)[None], torch.tensor([0.01], dtype=F64)
+    still = torch.zeros(1, 3, dtype=F64)
+    reach = float((body.centers[0].norm(dim=-1) + body.radii[0]).max()) + 0.02
+    way = torch.tensor([[1.0, 0.0, 0.0]], dtype=F64)
+    moving = (still, 20.0 * way) if spinning else (-2.0 * way, still)
+    least = reach + (0.01 * 20.0 * (reach - 0.02) if spinning else 0.02)
+    for away, near in ((least - 1e-3, True), (least + 1e-3 + PAIR_SMOOTHING_M, False)):
+        first = Placed(body, away * way, turn, *moving)
+        second = Placed(other, still, turn, still, still)
+        assert bool(near_body(first, second, step)) == near == bool(near_body(second, first, step))
+        assert not bool(near_body(Placed(body, away * way, turn, still, still), second, step))
 
 
 # In the suite: a measurement of time.
