@@ -77,6 +77,8 @@ class Candidate:
     """The turntable that the poses of the model are on; None where cameras are free."""
     noise_px: dict[str, float]
     """Noise of observations by image, before some were dropped."""
+    moved: dict[str, tuple[float, float]]
+    """How far that moved each centre, of the extent of all, and turned each camera [rad]; empty on a turntable."""
     attempt: int
     """Number of the attempt."""
 
@@ -191,6 +193,8 @@ def _attempt(
             focals=focals,
             motion=found.motion if found else None,
             noise_px={names[image]: noise for image, noise in models[0].noise_px.items()},
+            # the poses of a turntable are held by its motion
+            moved={} if found else {names[image]: moves for image, moves in models[0].moved.items()},
             attempt=number,
         )
     return candidate, _attempt_figures(settings, candidate)

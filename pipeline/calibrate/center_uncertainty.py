@@ -44,6 +44,7 @@ def pose_stds(
     with_exif: Collection[str] = (),
     motion: TurntableMotion | None = None,
     noise_px: Map[str, float] | None = None,
+    moved: Map[str, tuple[float, float]] | None = None,
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return what `center_stds` does, and the standard deviation of each camera's rotation [rad] after that alignment.
 
@@ -56,10 +57,18 @@ def pose_stds(
         with_exif: As there.
         motion: As there.
         noise_px: Noise of observations by image [px], before some were dropped; None takes that of those left.
+        moved: How far that moved each centre, of the extent, and turned each camera [rad]: a draw of their errors,
+            whose variance is added.
     """
     for _ in range(_TIMES_DOUBTED):
         model = without_most_telling(model, models, with_exif, motion, noise_px)
-    return _stds(model, posterior(model, models, with_exif, motion, noise_px))
+    stds = _stds(model, posterior(model, models, with_exif, motion, noise_px))
+    shifts, turns = ({image: both[k] for image, both in (moved or {}).items()} for k in (0, 1))
+    return _with(stds[0], shifts), _with(stds[1], turns)
+
+
+def _with(stds: dict[str, float], errors: Map[str, float]) -> dict[str, float]:
+    return {image: float(np.hypot(std, errors.get(image, 0.0))) for image, std in stds.items()}
 
 
 def _stds(model: SfmModel, found: Posterior) -> tuple[dict[str, float], dict[str, float]]:

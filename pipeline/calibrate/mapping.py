@@ -18,7 +18,7 @@ import pycolmap
 from ...datasets.io.progress import progress
 from ...schemas import CameraIntrinsics
 from .colmap import camera_names, count, run
-from .observation_noise import noise_by_image, noise_px
+from .observation_noise import moved_by_dropping, noise_by_image, noise_px
 from .reconstruction import Array, SfmCamera, SfmModel
 
 _Given = TypeVar("_Given")
@@ -41,6 +41,8 @@ class Mapped:
     """Name of each camera by COLMAP's identifier."""
     noise_px: Map[str, float] = field(default_factory=dict)
     """Noise of a coordinate of each image's observations [px] before some were dropped; empty where none were."""
+    moved: Map[str, tuple[float, float]] = field(default_factory=dict)
+    """How far dropping these moved each centre, of the extent of all, and turned the camera [rad]; likewise."""
 
     @property
     def image_count(self) -> int:
@@ -188,7 +190,8 @@ def without_outliers(mapped: Mapped, known: Map[str, CameraIntrinsics], seed: in
         _drop_undetermined(copy)
         _adjust(copy, _fixed(mapped, known), seed)
     _drop_undetermined(copy)
-    return Mapped(reconstruction=copy, names=mapped.names, noise_px=noise_by_image(mapped.model()))
+    found, before = Mapped(reconstruction=copy, names=mapped.names), mapped.model()
+    return replace(found, noise_px=noise_by_image(before), moved=moved_by_dropping(before, found.model()))
 
 
 def triangulated(mapped: Mapped, database: Path, root: Path, seed: int) -> Mapped:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .metric_scale import umeyama
 from .reconstruction import Array, SfmModel
 
 LEAST_NOISE_PX = 0.05
@@ -18,6 +19,8 @@ _MEDIAN_OF_RAYLEIGH = 1.1774
 """Median length of a vector of two normal numbers with standard deviation 1: sqrt(2 ln 2)."""
 _POSE = 6
 """Numbers of a pose."""
+_LEAST_IMAGES = 3
+"""Least number of centres that a similarity is found from."""
 _LEAST_FREE = 0.1
 """Least share of a photo's coordinates that its pose and points leave free, for the estimate of its noise."""
 
@@ -41,3 +44,25 @@ def noise_by_image(model: SfmModel) -> dict[str, float]:
         errors = model.errors_px(image) if len(seen) else np.zeros(1)
         noise[image] = noise_px(errors) / float(np.sqrt(free))
     return noise
+
+
+def moved_by_dropping(before: SfmModel, after: SfmModel) -> dict[str, tuple[float, float]]:
+    """Return how far each centre is from where it was, as a fraction of their extent, and the turn of the camera [rad].
+
+    Args:
+        before: The model before observations were dropped.
+        after: The same images afterwards; the similarity that brings the centres together best does not count.
+    """
+    images = [image for image in after.T_cam_world if image in before.T_cam_world]
+    old, new = (np.array([model.center(image) for image in images]) for model in (before, after))
+    extent = float(np.linalg.norm(np.ptp(new, axis=0)))
+    if len(images) < _LEAST_IMAGES or extent == 0.0:
+        return {}
+    aligned, moves = umeyama(old, new), {}
+    for image, was, now in zip(images, aligned.points(old), new, strict=True):
+        turn = aligned.pose(before.T_cam_world[image])[:3, :3] @ after.T_cam_world[image][:3, :3].T
+        moves[image] = (
+            float(np.linalg.norm(was - now)) / extent,
+            float(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))),
+        )
+    return moves

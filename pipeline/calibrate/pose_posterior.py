@@ -24,6 +24,7 @@ from collections.abc import Mapping as Map
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .bundle import POSE, PRINCIPAL, ReducedEquations, all_errors_px, linearized, told_by_points
 from .camera_models import LADDER, LENS_PARAMETERS
@@ -52,6 +53,11 @@ DOUBTED = 0.005
 """Share of all observations that may be wrong, wherever they do most harm (twice, `center_uncertainty`)."""
 DOUBTED_OF_PHOTO = 0.25
 """Largest share of a photo's observations among them, so that a photo with few matches keeps most of these."""
+ONE_PHOTO = 0.5
+"""Share of the squared displacement of all centres above which a direction is that of one photo."""
+TOLD_ELSEWHERE_DEG = 20.0
+"""Angle between the rays of two other photos to a point from which on it is where they see it: an outline that glides
+over a surface would leave residuals there."""
 
 _STILL = 0.3
 """Standard deviations by which a principal point is off before it is moved."""
@@ -134,6 +140,8 @@ def without_most_telling(
 
     Where two sides of an object share little, some twenty points tell how they lie to each other. Most of them may be
     wrong alike, as on an outline that glides over the surface, and then cameras bend until these agree with all others.
+    Where that direction is one photo's alone, as of one that is hidden in part, points stay whose places other photos
+    tell: they do not glide, and the photo's errors at them are its own.
 
     Args:
         model: As in `posterior`; as are the others.
@@ -143,13 +151,18 @@ def without_most_telling(
         noise_px: As there.
     """
     found, images = _solved(model, models, with_exif, motion, noise_px), list(model.T_cam_world)
-    told = told_by_points(model, found.models, found.reduced, found.weakest(len(images)), found.loss_px, found.noise_px)
+    weakest = found.weakest(len(images))
+    told = told_by_points(model, found.models, found.reduced, weakest, found.loss_px, found.noise_px)
     photo = np.repeat(np.arange(len(images)), [len(model.observations[image][1]) for image in images])
     point = np.concatenate([model.observations[image][1] for image in images])
     seen = np.split(photo[np.argsort(point, kind="stable")], np.cumsum(np.bincount(point, minlength=len(told)))[:-1])
     room, left = DOUBTED_OF_PHOTO * np.bincount(photo, minlength=len(images)), DOUBTED * len(point)
-    kept = np.ones(len(told), bool)
+    kept, moved = np.ones(len(told), bool), _squares(weakest, len(images))
+    alone = images[moved.argmax()] if moved.max() > ONE_PHOTO * moved.sum() else None
+    certain = _told_elsewhere(model, alone) if alone else np.zeros(len(told), bool)
     for index in np.argsort(-told, kind="stable"):
+        if certain[index]:
+            continue
         left -= len(seen[index])
         if left < 0:
             break
@@ -157,6 +170,28 @@ def without_most_telling(
             room[seen[index]] -= 1.0
             kept[index] = False
     return model.with_points(kept)
+
+
+def _squares(direction: Array, images: int) -> Array:
+    """Return the squared displacements of the centres along a direction (n,), shape (image,)."""
+    return (direction[: POSE * images].reshape(-1, POSE)[:, :3] ** 2).sum(1)
+
+
+def _told_elsewhere(model: SfmModel, image: str) -> NDArray[np.bool_]:
+    """Return whether two photos but one see a point from directions that are far apart, shape (point,)."""
+    own, apart = np.unique(model.observations[image][1]), np.zeros(len(model.points), bool)
+    place = np.full(len(model.points), -1)
+    place[own] = np.arange(len(own))
+    rays = np.full((len(own), len(model.T_cam_world), 3), np.nan)
+    for k, (other, (_, seen)) in enumerate(model.observations.items()):
+        if other != image:
+            shared = seen[place[seen] >= 0]
+            away = model.center(other) - model.points[shared]
+            rays[place[shared], k] = away / np.linalg.norm(away, axis=1, keepdims=True)
+    for point, ray in zip(own, rays, strict=True):
+        mine = ray[~np.isnan(ray[:, 0])]
+        apart[point] = len(mine) > 1 and (mine @ mine.T).min() < np.cos(np.radians(TOLD_ELSEWHERE_DEG))
+    return apart
 
 
 def _solved(

@@ -326,7 +326,7 @@ def _report(
 
 def _pose_stds(best: Candidate, inputs: Inputs) -> tuple[dict[str, float], dict[str, float]]:
     """Return the standard deviations of optical centres [% of their extent], at most 100, and rotations [deg], 180."""
-    centers, turns = pose_stds(*_estimated(best, inputs), noise_px=best.noise_px)
+    centers, turns = pose_stds(*_estimated(best, inputs), noise_px=best.noise_px, moved=best.moved)
     return (
         {image: round(min(100.0 * std, 100.0), 4) for image, std in centers.items()},
         {image: round(min(float(np.degrees(std)), 180.0), 3) for image, std in turns.items()},

@@ -13,7 +13,7 @@ from cgwm.pipeline.calibrate.camera_models import LADDER
 from cgwm.pipeline.calibrate.center_uncertainty import center_stds, pose_stds
 from cgwm.pipeline.calibrate.mapping import Mapped, adjusted, without_outliers
 from cgwm.pipeline.calibrate.metric_scale import umeyama
-from cgwm.pipeline.calibrate.observation_noise import noise_by_image
+from cgwm.pipeline.calibrate.observation_noise import moved_by_dropping, noise_by_image
 from cgwm.pipeline.calibrate.pose_posterior import posterior, principal_points
 from cgwm.pipeline.calibrate.reconstruction import SfmModel, Similarity
 from helpers.sfm_scene import look_at, make_scene, rotation_about
@@ -182,10 +182,23 @@ def test_two_sides_that_few_points_tie_are_less_certain_than_these_say() -> None
     assert ratio[6] > 3.0 and 1.0 <= ratio[300] < 1.3, ratio
 
 
-def test_a_photo_with_few_matches_keeps_most_of_them() -> None:
+def _few_in_one_photo() -> tuple[SfmModel, SfmModel]:
+    """Return a model, and one of whose photos sees twenty points that the others see from all sides."""
     model = _noisy(_scene(points=300), 1)
     pixels, index = model.observations["03.jpg"]
-    few = replace(model, observations={**model.observations, "03.jpg": (pixels[:20], index[:20])})
+    return model, replace(model, observations={**model.observations, "03.jpg": (pixels[:20], index[:20])})
+
+
+def test_a_photo_with_few_matches_keeps_all_whose_points_other_photos_tell() -> None:
+    _, few = _few_in_one_photo()
+    doubted = pose_posterior.without_most_telling(few, MODELS, (), None)
+    assert len(doubted.observations["03.jpg"][1]) == 20
+    assert max(pose_stds(few, MODELS)[0].values()) < 1.1 * max(center_stds(few, MODELS).values())
+
+
+def test_a_photo_with_few_matches_keeps_most_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_posterior, "TOLD_ELSEWHERE_DEG", 180.0)  # no point is
+    model, few = _few_in_one_photo()
     doubted = pose_posterior.without_most_telling(few, MODELS, (), None)
     left = {name: len(seen) for name, (_, seen) in doubted.observations.items()}
     assert 15 <= left["03.jpg"] < 20 and len(doubted.points) == len(doubted.colors) < 300
@@ -195,6 +208,21 @@ def test_a_photo_with_few_matches_keeps_most_of_them() -> None:
             doubted.points[index] @ model.T_cam_world[name][:3, :3].T + model.T_cam_world[name][:3, 3]
         )
         assert np.abs(drawn - pixels).max() < 6 * NOISE_PX  # each observation is still of its own point
+
+
+def test_what_dropping_moved_is_a_draw_of_the_errors() -> None:
+    before = _noisy(_scene(points=300), 0)
+    names, after = list(before.T_cam_world), before.transformed(Similarity(2.0, np.eye(3), np.ones(3)))
+    assert max(map(max, moved_by_dropping(before, after).values())) < 1e-6
+    turn = np.eye(4)
+    turn[:3, :3] = rotation_about([0, 1, 0], 0.01)
+    turned = replace(before, T_cam_world={**before.T_cam_world, names[3]: turn @ before.T_cam_world[names[3]]})
+    moved = moved_by_dropping(before, turned)
+    assert moved[names[3]][1] == pytest.approx(0.01, rel=0.1) and moved[names[0]][1] < 0.005
+    without, with_moves = (pose_stds(before, MODELS, moved=moves) for moves in (None, {names[3]: (0.3, 0.01)}))
+    assert with_moves[0][names[3]] == pytest.approx(np.hypot(without[0][names[3]], 0.3))
+    assert with_moves[1][names[3]] == pytest.approx(np.hypot(without[1][names[3]], 0.01))
+    assert with_moves[0][names[0]] == without[0][names[0]]
 
 
 def test_no_distortion_is_as_uncertain_as_a_distortion_of_zero() -> None:
