@@ -196,6 +196,14 @@ def size_of(body: Body) -> float:
     return float((body.centers[0].square().sum(-1).sqrt() + body.radii[0]).max())
 
 
+def _lever_of(body: Body) -> float:
+    """Return how far a turn by one radian may move the lowest points of a body's spheres [m]: 0 for a ball.
+
+    A turn moves the centres of spheres, not their surfaces about these.
+    """
+    return float(body.centers[0].norm(dim=-1).max())
+
+
 def clear_frames(world: World, observations: Observations, noise: Noise) -> Tensor:
     """Return the airborne frames (B, T): surely without contact, also between two frames.
 
@@ -208,9 +216,8 @@ def clear_frames(world: World, observations: Observations, noise: Noise) -> Tens
     if world.ground_normal is not None and world.ground_offset is not None:
         for column, index in enumerate(observations.free):
             heights = heights_of(world, world.bodies[index], observations, column)
-            margin = FLIGHT_MARGIN_M + LIMITS.height_sigmas * float(
-                np.hypot(noise.position_m, noise.rotation_rad * size_of(world.bodies[index]))
-            )
+            error = np.hypot(noise.position_m, noise.rotation_rad * _lever_of(world.bodies[index]))
+            margin = FLIGHT_MARGIN_M + LIMITS.height_sigmas * float(error)
             clear &= _apart(heights, margin)
     clear &= clear_of_surfaces(world, observations, noise)
     for a in range(len(observations.free)):

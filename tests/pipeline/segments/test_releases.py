@@ -127,3 +127,14 @@ def test_rotations_of_flights_have_a_reduced_chi_square_of_one() -> None:
     assert prepared.flight is not None
     found = _rotation_chi2(prepared.flight)
     assert len(found) == 6 and 0.8 < float(found.mean()) < 1.25
+
+
+def test_an_unknown_turn_of_a_ball_ends_no_flight() -> None:
+    """The lowest point of a ball lies under its centre however it turns; that of a cube does not."""
+    unknown = Noise(NOISE.position_m, 0.1)
+    for thing, same in (("ball", True), ("cube", False)):
+        world = world_with(thing)
+        whole = whole_episodes(world, thrown(world, count=2))
+        known, turned = (cut_episodes(world, whole, noise)[2] for noise in (NOISE, unknown))
+        assert bool((known == turned).all()) == same
+        assert not bool((turned & ~known).any())
