@@ -82,9 +82,6 @@ NUMERICS = {
     "next_experiment/motions.SIZES": "which sizes motions are chosen for",
     "next_experiment/motions.MOST_MOTIONS": "how many motions are asked for at a time",
     "next_experiment/motions.WORTH_TELLING": "which effects a proposal names",
-    "contact/sliding.FIRST_ITERATIONS": "end of a descent",
-    "contact/sliding.MOST_PASSES": "end of a descent",
-    "contact/sliding.MANY": "size of a batch",
     "sparse_regression.EXPONENTS": "grid of a search",
 }
 """Numbers of modules in `pipeline/diagnose` outside of the table, each with the reason why it decides no verdict."""
@@ -105,6 +102,8 @@ SEGMENT_NUMERICS = {
         "segment_states.SEARCHES, SEARCH_ITERATIONS",
         "sliding/descent.ITERATIONS, MAX_DAMPING, FALL, FALL_SHARE",
         "sliding/residuals.SWEEPS",
+        "sliding/variant_fits.FIRST_ITERATIONS",
+        "sliding/variant_fits.MOST_PASSES",
         "flights/variance_components.STEPS",
         "flights/variance_components.LONGEST, ENOUGH",
         "flights/variance_components.LEAST_INFORMATION",
@@ -144,6 +143,7 @@ SEGMENT_NUMERICS = {
         "linearization.PART_ROLLOUTS",
         "flights/slow_errors.FLIGHTS",
         "flights/contrasts.FRAMES",
+        "sliding/variant_fits.MANY",
     ),
     "keeps a matrix regular": (
         "mixed_model.LEAST_SHARE",
