@@ -25,6 +25,8 @@ LEAST_INFORMATION, ROUNDING = 1e-30, 1e-10
 largest; smaller values are raised to these."""
 
 
+LEAST_DOF = 1.0
+"""Fewest degrees of freedom: a number that one episode alone tells has none."""
 ENOUGH_EPISODES = 8
 """Minimum number of episodes from which their scatter alone determines the intervals."""
 
@@ -63,6 +65,25 @@ def few_covariance(information: Array, scores: Array, prior: Array | None = None
         parts.append(curvature @ (directions * np.sqrt(sizes.clip(0.0))))
     scatter = sum((part @ part.T for part in parts), np.zeros_like(curvature))
     return scatter if count >= ENOUGH_EPISODES else _wider(curvature, scatter)
+
+
+def student_reach(information: Array, covariance: Array) -> Array:
+    """Return by how much more standard errors intervals have to reach where few of many episodes tell a number.
+
+    What scatters between n episodes that tell as much has n - 1 degrees of freedom. Where some tell more than others,
+    the number is that of as many alike: the square of the sum of what each adds, over the sum of squares (Satterthwaite
+    1946). `few_covariance` has Student's t for all episodes; this is the ratio to it of that for those that count.
+
+    Args:
+        information: Information of each episode, shape (E, P, P).
+        covariance: Inverse of the information of all (P, P).
+    """
+    told = np.einsum("kp,epq,kq->ek", covariance, information, covariance)
+    shares = told / told.sum(0).clip(1e-300)
+    alike = 1 / np.square(shares).sum(0).clip(1.0 / len(shares))
+    dof = np.clip(alike - 1, LEAST_DOF, None)
+    usual = student_quantile(0.975, max(len(information) - 1, LEAST_DOF))
+    return np.array([max(student_quantile(0.975, float(n)) / usual, 1.0) for n in dof])
 
 
 def _wider(covariance: Array, other: Array) -> Array:

@@ -212,6 +212,9 @@ class SlidingStart:
         parameters = nuisance_parameters(neutral, known)
         sliding = found.segments.in_world(neutral)
         information, score = information_by_segment(sliding, parameters, found.values[0])
+        episodes = torch.tensor([item.episode for item in sliding.items])
+        own = (episodes == episodes.unique()[:, None]).to(information)
+        units, score = torch.einsum("eb,bpq->epq", own, information), own @ score
         # no prior on the friction: its start comes from the same segments, and would decide about similar effects
         prior = torch.tensor([0.0 if p is FRICTION else 1 / p.prior[1] ** 2 for p in parameters]).to(information)
         excess = max(found.cost / float(sliding.dof.sum()), 1.0)
@@ -227,8 +230,9 @@ class SlidingStart:
             names,
             parameters,
             found.values[0],
-            information.sum(0),
+            units.sum(0),
             prior,
+            units,
             score,
             excess,
             record,
@@ -291,6 +295,7 @@ class ImpactStart:
             torch.as_tensor(found.values),
             torch.as_tensor(found.information) - torch.diag(prior),
             prior,
+            slopes.mT @ slopes,
             -(slopes.mT @ rows[..., None])[..., 0],
             excess,
             record,

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...optimization.uncertainty import REACH, correlation_of, few_covariance
+from ...optimization.uncertainty import REACH, correlation_of, few_covariance, inverse, student_reach
 from ...physics.effects import ActiveEffect
 from ...physics.parameters import Parameter
 from ...physics.world import World
@@ -31,6 +31,7 @@ def identified_effects(
     values: Tensor,
     information: Tensor,
     prior: Tensor,
+    units: Tensor,
     score: Tensor,
     excess: float,
     record: dict[str, Any],
@@ -47,8 +48,9 @@ def identified_effects(
         values: Estimates in fitted coordinates, shape (P,).
         information: Information on the values without priors, shape (P, P).
         prior: Information of the priors, shape (P,).
-        score: Gradient of the log-likelihood of each segment, shape (B, P). The error of an effect's formula is common
-            to all frames of a segment.
+        units: Information of each unit, shape (U, P, P): an episode, or an impact. The error of an effect's formula, or
+            of the contact law, is common to all frames of one.
+        score: Gradient of the log-likelihood of each unit, shape (U, P).
         excess: Ratio of the variance of the residuals to that of the noise.
         record: Course of the fit, for `fit.json`.
         apart: How far each value (P,) is from those of other minima that the data do not tell from this one.
@@ -58,11 +60,14 @@ def identified_effects(
     covariance = few_covariance(
         information.numpy() / excess + prior_information, score.numpy() / excess, prior_information
     )
+    std = np.sqrt(np.diag(covariance))
+    known = std < SEGMENT_THRESHOLDS.preparation.unobservable_share * np.array([p.prior[1] for p in parameters])
+    few = student_reach(units.numpy() / excess, inverse(information.numpy() / excess + prior_information))
+    covariance = covariance * np.outer(few, few)
     if apart is not None:  # an interval holds the other minima, too
         wider = 1 + apart / (REACH * np.sqrt(np.diag(covariance)))
         covariance = covariance * np.outer(wider, wider)
     std = np.sqrt(np.diag(covariance))
-    known = std < SEGMENT_THRESHOLDS.preparation.unobservable_share * np.array([p.prior[1] for p in parameters])
     identified = {name for name, yes in zip(effect_of, known, strict=True) if yes and name in names}
     kept = [k for k, name in enumerate(effect_of) if name in identified]
     if not kept:

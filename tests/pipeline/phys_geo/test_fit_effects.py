@@ -273,6 +273,16 @@ def test_what_carries_no_information_has_a_wide_interval() -> None:
         assert np.sqrt(np.diag(covariance).max()) > 1e4
 
 
+def test_few_of_many_episodes_that_tell_a_number_are_few() -> None:
+    """Eight alike are eight; where one tells nine tenths of a number, its interval is that of two episodes."""
+    alike = np.tile(np.eye(1), (8, 1, 1))
+    assert uncertainty.student_reach(alike, np.eye(1) / 8) == pytest.approx(1.0)
+    one = np.array([0.9, *[0.1 / 7] * 7])[:, None, None]
+    reach = uncertainty.student_reach(one, np.eye(1))
+    assert reach == pytest.approx(uncertainty.student_quantile(0.975, 1) / uncertainty.student_quantile(0.975, 7))
+    assert (uncertainty.student_reach(0 * alike, np.eye(1)) >= 1.0).all()
+
+
 def test_few_episodes_make_intervals_wider_where_they_scatter_and_never_narrower() -> None:
     information = np.diag([100.0, 4.0])
     alike, apart = np.zeros((3, 2)), np.array([[30.0, 0.0], [-30.0, 0.0], [0.0, 0.0]])
