@@ -145,6 +145,10 @@ class PlanningController(ABC):
     def _objective(self, state: ControlState, acts_s: float) -> tuple[PlanObjective, Tensor]:
         """Return the objective of a plan, and the plan before over its pieces, shape (N, joints)."""
 
+    def _solver_now(self) -> Solver:
+        """Return the solver of the plan whose objective was just made."""
+        return self._solver
+
     def restart(self, seed: int) -> None:
         """Forget all plans and states, and begin with another seed."""
         self._rng = np.random.default_rng([seed, 1])
@@ -257,7 +261,7 @@ class PlanningController(ABC):
         self._bad, self._last_s = 0, state.time_s
         wall, cpu = time.perf_counter(), time.process_time()
         objective, warm = self._objective(state, state.time_s if acts_s is None else max(acts_s, state.time_s))
-        found = self._solver.solve(objective, warm, objective.propose(warm), self._rng)
+        found = self._solver_now().solve(objective, warm, objective.propose(warm), self._rng)
         self._found = objective, found.values
         self._plan = ControlPlan(
             state_s=state.time_s,

@@ -18,9 +18,10 @@ from ..controller import drawn_worlds, require_draws
 from ..horizon import Targets
 from ..objective import Worlds
 from ..planning import ControlState, PlanningController
-from ..solvers import solver_of
+from ..solvers import Solver, solver_of
 from .elites import Elites
 from .objective import HandObjective
+from .patience import FARTHER, Patience
 from .tracker import LONGEST_S, STEP_S, HandTracker
 from .world import HandWorld, hand_world, world_of
 
@@ -59,6 +60,7 @@ class HandController(PlanningController):
         self.hand: HandWorld = hand_world(model, task)
         self.task = task
         self.goal_wxyz = np.array(task.start.quat_wxyz)
+        self._patience, self._impatient = Patience(task), False
         where, found = str(resolve_device(device)), self.hand
 
         def planned(drawn: Model | None, step_s: float = task.planner.step_s) -> World:
@@ -71,12 +73,15 @@ class HandController(PlanningController):
         worlds = drawn_worlds(model, draws, seed, where, planned, likely)
         tracked = partial(planned, step_s=min(STEP_S, task.planner.step_s))
         self._tracker = HandTracker(found, drawn_worlds(model, draws, seed, where, tracked, likely))
-        super().__init__(task.planner, worlds, solver_of(solver, Elites(task.planner.samples)), where, seed)
+        # of long plans that differ much the mean would be none of them
+        self._usual, self._alone = (solver_of(solver, Elites(task.planner.samples, best=best)) for best in (3, 1))
+        super().__init__(task.planner, worlds, self._usual, where, seed)
 
     def restart(self, seed: int) -> None:
         """See :class:`PlanningController`."""
         super().restart(seed)
         self._tracker.restart(seed)
+        self._patience.aim()
         self._tracked_s = -math.inf
 
     @property
@@ -103,6 +108,7 @@ class HandController(PlanningController):
                 todo="give four finite numbers that are not all 0.",
             )
         self.goal_wxyz = goal / np.linalg.norm(goal)
+        self._patience.aim()
 
     def _sent_since(self, state: ControlState) -> Targets | None:
         """Return the targets of the joints since the last state that was tracked; None where they are unknown."""
@@ -112,6 +118,10 @@ class HandController(PlanningController):
         # before the first command, and after the last one, the targets stay
         held = Targets(times_s=np.array([0.0]), values_m=self._sent[-1][1][None])
         return self._given(held, max(since, state.time_s - LONGEST_S), state.time_s)
+
+    def _solver_now(self) -> Solver:
+        """See :class:`PlanningController`."""
+        return self._alone if self._impatient and self._solver is self._usual else self._solver
 
     def _planned_in(self) -> Worlds:
         """Return the worlds that plans are evaluated in: those of all draws, or that which agreed best."""
@@ -128,11 +138,13 @@ class HandController(PlanningController):
             self._plan.targets if self._plan else Targets(times_s=np.array([state.time_s]), values_m=measured[None])
         )
         believed = self._tracker.update(state, self._sent_since(state))
+        self._impatient = self._patience.over(state.time_s, believed.quat_wxyz[0, hand.object].numpy(), self.goal_wxyz)
         lead = self._given(before, state.time_s, acts_s)
         if acts_s - state.time_s > self.interval_s + 1e-9:  # the planner's own steps do for one command
             believed = self._tracker.ahead(believed, lead)
             lead = Targets(times_s=lead.times_s[-1:], values_m=lead.values_m[-1:])
-        knots = acts_s + planner.horizon_s / planner.knots * np.arange(1, planner.knots + 1)
+        length_s = planner.horizon_s * (FARTHER if self._impatient else 1.0)
+        knots = acts_s + length_s / planner.knots * np.arange(1, planner.knots + 1)
         objective = HandObjective(
             hand=hand,
             worlds=self._planned_in(),
