@@ -37,7 +37,11 @@ perfectly flat, and engines differ by as much. The torque about the normal that 
 
 
 def soft_world(world: World) -> World:
-    """Return the world with a soft contact without rebound, in which the body rests as high as on a hard one."""
+    """Return the world with a soft contact without rebound, in which the body rests nearly as high as on a hard one.
+
+    It rests 0.53 g tau^2 higher, half a millimetre: in steps of half the contact time tau it sinks by 0.47 g tau^2.
+    That is a quarter of the standard deviation of the ground's height, a nuisance of each fit.
+    """
     law, gravity = contact_law(world), float(world.gravity[0].norm())
     soft = replace(
         law,
