@@ -229,6 +229,18 @@ class Video(FileModel):
     """Added to the frame times of a camera [s]."""
 
 
+_LEAST_LENGTH_M, _MOST_MARKER_M, _MOST_DISTANCE_M = 0.002, 3.0, 50.0
+"""Lengths of the sources of scale that are not taken for those in another unit [m]."""
+
+
+def _in_metres(length_m: float, what: str, most_m: float) -> float:
+    """Return a length that a scene on a table or in a room may have; refuse others, which are in another unit."""
+    if not _LEAST_LENGTH_M <= length_m <= most_m:
+        hint = f"; {length_m / 1000.0:g} if these are millimetres" if length_m > most_m else ""
+        raise ValueError(f"{what} of {length_m:g} m; lengths are in metres, {_LEAST_LENGTH_M:g} to {most_m:g}{hint}")
+    return length_m
+
+
 class Marker(FileModel):
     """An ArUco marker of known size that is visible in the photos."""
 
@@ -237,6 +249,11 @@ class Marker(FileModel):
     """Length of the black square's side [m]."""
     pose: Pose | None = None
     """T_world_marker (x right, y up as printed, z out of the paper); fixes the world frame where given."""
+
+    @field_validator("side_m")
+    @classmethod
+    def _side_in_metres(cls, side_m: float) -> float:
+        return _in_metres(side_m, "a marker", _MOST_MARKER_M)
 
 
 class KnownDistance(FileModel):
@@ -247,6 +264,11 @@ class KnownDistance(FileModel):
     """Photo (path relative to images/) to pixel (x, y) of the first point; top-left pixel centre is (0.5, 0.5)."""
     b_px: dict[str, tuple[Pixel, Pixel]]
     """The same for the second point."""
+
+    @field_validator("distance_m")
+    @classmethod
+    def _distance_in_metres(cls, distance_m: float) -> float:
+        return _in_metres(distance_m, "a distance", _MOST_DISTANCE_M)
 
     @model_validator(mode="after")
     def _two_views(self) -> KnownDistance:
@@ -262,6 +284,11 @@ class KnownCameraDistance(FileModel):
     distance_m: Length
     images: tuple[str, str]
     """The two photos (paths relative to images/)."""
+
+    @field_validator("distance_m")
+    @classmethod
+    def _distance_in_metres(cls, distance_m: float) -> float:
+        return _in_metres(distance_m, "a distance", _MOST_DISTANCE_M)
 
 
 class Calibration(FileModel):
