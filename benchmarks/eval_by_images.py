@@ -36,10 +36,11 @@ from cgwm.pipeline.fit import fit
 from cgwm.schemas import CalibrateConfig, CgwmError, InputDataError, PhysConfig, SplatConfig
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from store import Keyed, Store
+from store import Store
 from tabletop import MATERIALS, make_capture
-from tabletop.capture import TASKS, Task
+from tabletop.capture import TASKS
 from tabletop.engines import refusal
+from tabletop.jobs import CaptureJob
 from tabletop.objects import load_item
 
 Array = NDArray[np.float64]
@@ -51,14 +52,9 @@ _KINDS = (("true cameras", False), ("calibrated cameras", True))
 
 
 @dataclass(frozen=True)
-class Job(Keyed):
-    """One capture."""
+class Job(CaptureJob):
+    """One capture, and which cameras it has."""
 
-    task: Task
-    object: str
-    material: str
-    engine: str
-    seed: int
     calibrated: bool
 
 

@@ -41,9 +41,10 @@ from contenders.floor import Floor
 from fall_push_engines import bootstrap_interval
 from scoring import Judge, _as_prediction, pose_errors
 from steps import Step, run_steps
-from store import ROOT, Keyed, Store, timed
+from store import ROOT, Store, timed
 from tabletop.capture import Task
 from tabletop.draft import Draft
+from tabletop.jobs import CaptureJob
 
 STORED, CHART = ROOT / "benchmarks" / "few_photos_rows.jsonl", ROOT / "docs" / "few-photos.svg"
 EVERY, TESTS = 4, 6
@@ -55,14 +56,9 @@ ROWS = {TWO: Cgwm(), JOINT: Cgwm(JOINT, {"geometry": True}), FLOOR: Floor()}
 
 
 @dataclass(frozen=True)
-class Job(Keyed):
+class Job(CaptureJob):
     """One capture with some of its photos."""
 
-    task: str
-    object: str
-    material: str
-    engine: str
-    seed: int
     photos: str
 
 

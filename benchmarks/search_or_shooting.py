@@ -37,9 +37,10 @@ from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise
 from cgwm.schemas import NotConvergedError, PhysConfig
 from one_motion import NOISE, noisy_episode, true_shape_world
-from store import Keyed, Store
+from store import Store
 from tabletop.capture import Task, plan_capture
 from tabletop.engines import ENGINES, refusal
+from tabletop.jobs import ObjectJob
 from tabletop.materials import MATERIALS
 from tabletop.objects import load_item
 
@@ -48,13 +49,9 @@ TOLERANCES = (0.0, 1.5, 2.0, 3.0, 5.0, math.inf)
 
 
 @dataclass(frozen=True)
-class Job(Keyed):
+class Job(ObjectJob):
     """One fit and what it predicts."""
 
-    engine: str
-    object: str
-    material: str
-    seed: int
     task: Task = "fall"
 
 

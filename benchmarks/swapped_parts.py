@@ -19,7 +19,7 @@ import argparse
 import itertools
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,24 +37,14 @@ from contenders.floor import Floor
 from contenders.training import rolled_out
 from fall_push import Work
 from scoring import Judge, pose_errors
-from store import Keyed, Store
+from store import Store
 from tabletop import MATERIALS
+from tabletop.jobs import CaptureJob
 
 PARTS = ("shape", "mass", "friction", "fingertip's friction", "ground's numbers", "fingertip's numbers")
 
 
-@dataclass(frozen=True)
-class Job(Keyed):
-    """One capture."""
-
-    task: str
-    object: str
-    material: str
-    engine: str
-    seed: int
-
-
-def measure(job: Job, work: Work, damping: Sequence[float] = ()) -> dict[str, Any]:
+def measure(job: CaptureJob, work: Work, damping: Sequence[float] = ()) -> dict[str, Any]:
     """Fit a capture, and return the errors of its tests (mm, deg) in every mixture of the fitted and the true world.
 
     Args:
@@ -182,7 +172,7 @@ def main() -> int:
         damping = [float(one) for one in given.damping.split(",") if one]
         kinds = [getattr(given, name).split(",") for name in ("tasks", "objects", "materials", "engines")]
         for task, name, material, engine in itertools.product(*kinds):
-            job = Job(task, name, material, engine, given.seed)
+            job = CaptureJob(task, name, material, engine, given.seed)
             store.result(job.key, lambda job=job: measure(job, work, damping))
     print(table(store.results()))
     return 0

@@ -32,9 +32,10 @@ from cgwm.datasets.synthetic.plan import ScenePlan
 from cgwm.schemas import NotConvergedError
 from engine_floor import UNIT_DEG, UNIT_MM
 from numpy.typing import NDArray
-from store import Keyed, Store
+from store import Store
 from tabletop.capture import plan_capture
 from tabletop.engines import ENGINES, refusal
+from tabletop.jobs import ObjectJob
 from tabletop.materials import MATERIALS
 from tabletop.objects import load_item
 from tabletop.true_world import Numbers, pose_errors, spheres_of, true_world
@@ -49,17 +50,7 @@ IMPACT, CARRIED, MOVING_M_S, _BIN_S = 2.5, 0.3, 0.03, 0.005
 of a slide; and over how long forces are averaged."""
 
 
-@dataclass(frozen=True)
-class Job(Keyed):
-    """The tosses of one capture."""
-
-    engine: str
-    object: str
-    material: str
-    seed: int
-
-
-def measure(job: Job) -> dict[str, Any]:
+def measure(job: ObjectJob) -> dict[str, Any]:
     """Return the errors [mm, deg] of every motion, the one to learn from first, by factor; or why there are none."""
     item = load_item(job.object)
     reason = refusal(job.engine, item.solid)
@@ -189,7 +180,7 @@ def main() -> int:
     if given.what == "table":
         print(table(store.results()))
         return 0
-    jobs = [Job(*one) for one in itertools.product(given.engines.split(","), OBJECTS, MATERIALS, SEEDS)]
+    jobs = [ObjectJob(*one) for one in itertools.product(given.engines.split(","), OBJECTS, MATERIALS, SEEDS)]
     order = np.random.default_rng(0).permutation(len(jobs))
     store.fill(measure, {jobs[k].key: (jobs[k],) for k in order}, given.workers)
     return 0
