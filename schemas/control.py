@@ -42,6 +42,22 @@ class TaskSection(FileModel):
     """A part of a task; `task_toml` writes the texts of its fields as comments."""
 
 
+class TaskFile(TaskSection):
+    """A task as a file has it."""
+
+    _source: str = PrivateAttr("the task")
+
+    @property
+    def source(self) -> str:
+        """Where the task comes from, for messages: its file where it was read from one."""
+        return self._source
+
+    @property
+    def folder(self) -> Path:
+        """Folder that the files of the task are relative to."""
+        return Path(self._source).parent if self._source != "the task" else Path()
+
+
 class RobotSection(TaskSection):
     """What acts: a finger, a ball that moves in the plane on position servos."""
 
@@ -201,7 +217,7 @@ class PlantSection(TaskSection):
     """Time step of MuJoCo [s]."""
 
 
-class ControlTask(TaskSection):
+class ControlTask(TaskFile):
     """A task of control. Lengths are in metres, angles in degrees; the plane is the model's ground."""
 
     format: Literal["cgwm-task/1"] = TASK_FORMAT
@@ -216,17 +232,6 @@ class ControlTask(TaskSection):
     planner: PlannerSection = PlannerSection()
     success: SuccessSection = SuccessSection()
     plant: PlantSection = PlantSection()
-    _source: str = PrivateAttr("the task")
-
-    @property
-    def source(self) -> str:
-        """Where the task comes from, for messages: its file where it was read from one."""
-        return self._source
-
-    @property
-    def folder(self) -> Path:
-        """Folder that the files of the task are relative to."""
-        return Path(self._source).parent if self._source != "the task" else Path()
 
     @model_validator(mode="after")
     def _complete(self) -> ControlTask:

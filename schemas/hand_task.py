@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, model_validator
 
 from .base import read_toml
 from .capture import Name
@@ -21,6 +21,7 @@ from .control import (
     Rate,
     Samples,
     Share,
+    TaskFile,
     TaskSection,
     read_task,
 )
@@ -194,7 +195,7 @@ class HandPlantSection(TaskSection):
     """Standard deviation of the measured rotation [deg]."""
 
 
-class HandTask(TaskSection):
+class HandTask(TaskFile):
     """A task of control for a hand. Lengths are in metres; angles of joints in radians, others in degrees."""
 
     format: Literal["cgwm-hand-task/1"] = HAND_FORMAT
@@ -210,17 +211,6 @@ class HandTask(TaskSection):
     sensing: HandSensingSection = HandSensingSection()
     success: HandSuccessSection = HandSuccessSection()
     plant: HandPlantSection = HandPlantSection()
-    _source: str = PrivateAttr("the task")
-
-    @property
-    def source(self) -> str:
-        """Where the task comes from, for messages: its file where it was read from one."""
-        return self._source
-
-    @property
-    def folder(self) -> Path:
-        """Folder that the files of the task are relative to."""
-        return Path(self._source).parent if self._source != "the task" else Path()
 
     @property
     def wanted_m(self) -> Position3:
