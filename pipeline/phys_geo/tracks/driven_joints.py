@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....datasets.capture.tracks import Episode
-from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
+from ...optimization.levenberg_marquardt import Solution, robust_loss
 from ...physics.chains.parameters import LOSSES, chain_parameters, mass_factor
 from ...physics.parameters import GAP, gap_parameters
 from ...physics.world import World
@@ -40,7 +40,7 @@ from ...trajectories.track_noise import Noise, estimate_noise
 from .driven_result import DrivenFit, Pressed
 from .force_driven import LOADED, ForceDriven, Grid
 from .force_intervals import impulse_variance, kicked_intervals, parts_of_force, senses_of_motion
-from .joint_losses import FLAT, ITERATIONS, ROBUST_SCALE, TOLERANCE, JointLosses, information_root, starts, takes
+from .joint_losses import FLAT, ROBUST_SCALE, JointLosses, information_root, starts, takes
 from .joint_tracks import JointTracks
 from .loss_posterior import posterior
 from .pushed_episodes import APART_M, Pushed, pushed_link, pushes_of, sensor_zero
@@ -207,25 +207,9 @@ def _fitted(data: _Data) -> DrivenFit:
         for p, unit, value in zip(data.parameters, units, start, strict=True)
     ]
     every = first + [((-most, most), middle, std) for middle, std, most in NOTED]
-    bounds = torch.tensor([limits for limits, _, _ in every], dtype=torch.float64)
-    centre, known = torch.tensor([(middle, std**-2) for _, middle, std in every], dtype=torch.float64).T
-    point = centre.clone()
-    states, best = torch.zeros(len(data.part), data.size).to(centre), None
-    for scale in (None, ROBUST_SCALE):  # far from the tracks a robust loss has no slope
-        best = minimise(
-            data.residuals,
-            point,
-            states,
-            bounds,
-            robust_scale=scale,
-            iterations=ITERATIONS,
-            tolerance=TOLERANCE,
-            damp_states=False,  # forces on many parts take each other's place: damped steps would be short
-            prior_information=torch.ones(data.size).to(centre),
-            shared_prior=(centre, known),
-        )
-        point, states = best.shared, best.states
-    assert best is not None
+    states = torch.zeros(len(data.part), data.size, dtype=torch.float64)
+    # forces on many parts take each other's place: damped steps would be short
+    best, centre, known = data.descent(states, every, damp_states=False)
     count = len(data.parameters)
     record = _misfit(data, best)
     information, slopes = best.information.numpy() / record["information_over"], best.scores.numpy()

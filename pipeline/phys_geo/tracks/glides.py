@@ -31,7 +31,7 @@ from scipy.optimize import lsq_linear
 
 from ....datasets.capture.tracks import Episode
 from ....schemas.materials import of_pair
-from ...optimization.levenberg_marquardt import Solution, minimise, robust_loss
+from ...optimization.levenberg_marquardt import Solution, robust_loss
 from ...optimization.uncertainty import REACH
 from ...physics.chains.parameters import LOSSES, chain_parameters
 from ...physics.parameters import CONTACT_TIME, DAMPING_RATIO, Parameter
@@ -43,10 +43,8 @@ from .driven_result import DrivenFit
 from .force_driven import NEAR_M, ForceDriven, Grid
 from .joint_losses import (
     FLAT,
-    ITERATIONS,
     MOST_FRAMES,
     ROBUST_SCALE,
-    TOLERANCE,
     JointLosses,
     information_root,
     starts,
@@ -195,24 +193,8 @@ def _fitted(data: _Parts) -> tuple[NDArray[np.float64], NDArray[Any], dict[str, 
         ((p.bounds[0] / unit, p.bounds[1] / unit), 1.0, 1 / FLAT) if unit else (p.limits, 0.0, p.prior[1])
         for p, unit in zip(data.parameters, data.units.tolist(), strict=True)
     ]
-    bounds = torch.tensor([limits for limits, _, _ in first], dtype=torch.float64)
-    centre, known = torch.tensor([(middle, std**-2) for _, middle, std in first], dtype=torch.float64).T
-    point, states = centre.clone(), data.tracks.values.new_zeros(len(data.root), 2 * data.tracks.values.shape[2])
-    best = None
-    for scale in (None, ROBUST_SCALE):  # far from the tracks a robust loss has no slope
-        best = minimise(
-            data.residuals,
-            point,
-            states,
-            bounds,
-            robust_scale=scale,
-            iterations=ITERATIONS,
-            tolerance=TOLERANCE,
-            prior_information=torch.ones(states.shape[1]).to(centre),
-            shared_prior=(centre, known),
-        )
-        point, states = best.shared, best.states
-    assert best is not None
+    states = data.tracks.values.new_zeros(len(data.root), 2 * data.tracks.values.shape[2])
+    best, _, _ = data.descent(states, first)
     misfit = _misfit(data, best)
     over = max(1.0, misfit)
     information, slope = best.information.numpy() / over, best.scores.sum(0).numpy() / over

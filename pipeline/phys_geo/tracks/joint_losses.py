@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from ...optimization.levenberg_marquardt import Solution, minimise
 from ...physics.parameters import Parameter
 from ...physics.world import World
 from .force_driven import ForceDriven
@@ -68,6 +69,36 @@ class JointLosses:
         """Return residuals (E, T, J) in sigmas and their derivatives by all coordinates of a point; see `minimise`."""
         point = torch.cat((shared.expand(len(states), -1), states), 1)
         return by_differences(self._residuals, point, len(self.parameters), with_jacobian)
+
+    def descent(
+        self, states: Tensor, begin: Sequence[tuple[tuple[float, float], float, float]], damp_states: bool = True
+    ) -> tuple[Solution, Tensor, Tensor]:
+        """Return the robust least squares of all coordinates, and centres and information of the priors of common ones.
+
+        Args:
+            states: Of each episode to start from, with priors of unit width about 0.
+            begin: Limits of each coordinate that is common, the centre of its prior, where it starts, and its width.
+            damp_states: As of `minimise`.
+        """
+        bounds = torch.tensor([limits for limits, _, _ in begin], dtype=torch.float64)
+        centre, known = torch.tensor([(middle, std**-2) for _, middle, std in begin], dtype=torch.float64).T
+        point, best = centre.clone(), None
+        for scale in (None, ROBUST_SCALE):  # far from the tracks a robust loss has no slope
+            best = minimise(
+                self.residuals,
+                point,
+                states,
+                bounds,
+                robust_scale=scale,
+                iterations=ITERATIONS,
+                tolerance=TOLERANCE,
+                damp_states=damp_states,
+                prior_information=torch.ones(states.shape[1]).to(centre),
+                shared_prior=(centre, known),
+            )
+            point, states = best.shared, best.states
+        assert best is not None
+        return best, centre, known
 
     def _residuals(self, point: Tensor, episode: Tensor) -> Tensor:
         count, joints = len(self.parameters), self.tracks.values.shape[2]
