@@ -11,7 +11,7 @@
 Each case is a capture of `hidden_effects` (MuJoCo or drake as the truth, with formulas of their own), fitted and
 diagnosed as a user would: `cgwm fit`, `cgwm diagnose`; where a large effect was named rightly, `cgwm fit --from
 --effects` and the errors on the test split before and after. Thresholds may be chosen by the stage development, never
-by report to report12, whose seeds are others (each later one: since what the one before said was seen).
+by report to report13, whose seeds are others (each later one: since what the one before said was seen).
 Results are stored case by case and taken up again; `--record` writes the figures of a whole report into
 benchmarks/results/, from which `make results` makes docs/results.md.
 """

@@ -26,6 +26,7 @@ Stage = Literal[
     "report10",
     "report11",
     "report12",
+    "report13",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on the first stage alone. Results on a report stage were known when `diagnose` was changed
@@ -44,9 +45,10 @@ afterwards, so that each of these changes has to be judged on a later stage:
   alone needed a larger score (2026-11-26);
 - `report9`: segments of contact named again what slides rank first, and some effects alone (2026-11-27);
 - `report10`: segments of contact were linearised at the fits of effects (2026-11-27);
-- `report11`: errors of sessions and second effects were weighed anew (2026-11-27).
+- `report11`: errors of sessions and second effects were weighed anew (2026-11-27);
+- `report12`: effects in flight whose parameters differ between episodes were withheld (2026-11-28).
 
-The present version is judged on `report12`."""
+The present version is judged on `report13`."""
 Noise = Literal["spread", "study"]
 
 UNKNOWN = tuple(name for name, entry in EFFECTS.items() if entry.acts == "unknown")
