@@ -42,6 +42,7 @@ from . import colmap
 from .attempts import MIN_PHOTOS, Candidate, check_figures, estimated, photo_count, photo_labels, search, verdict
 from .center_uncertainty import UNCERTAIN_CENTER, pose_stds
 from .depth_scale import from_depth
+from .folded_cameras import folded_sides
 from .given_intrinsics import read_intrinsics
 from .markers import detect_markers, dictionary
 from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
@@ -411,6 +412,14 @@ def _warnings(best: Candidate) -> list[str]:
         warnings.append(
             f"the images fall into parts that share too few points: the largest, of {len(best.model.T_cam_world)}, is "
             f"taken; {sizes} images are in others"
+        )
+    photos = sorted(name for name in best.model.T_cam_world if not name.startswith(video_label("")))
+    if (sides := folded_sides(best.model, photos)) > 1:
+        others = "another" if sides == 2 else f"{sides - 1} others"
+        warnings.append(
+            f"most photos share their place with {others}: unless they were taken so, the "
+            f"object looks alike from {sides} sides, whose cameras lie upon each other; put something "
+            "with a print of its own beside it or on it"
         )
     without = len(best.check.images_without_strong_pair)
     if without > _MANY_WITHOUT_STRONG * len(best.model.T_cam_world):
