@@ -36,6 +36,7 @@ from ...runtime.device import resolve_device
 from ...trajectories.track_noise import Noise
 from ..effects.requested_effects import fit_with_effects
 from ..tracks.contact_result import ContactEstimate, PhysicsFit, physics_fit
+from .alike_sides import with_alike_sides
 from .end_to_end import ImageObjective, Refined, refine_end_to_end
 from .image_problem import ImageProblem, TracksEstimate, filmed_episodes, image_problem
 from .silhouettes import body_outlines
@@ -90,6 +91,7 @@ def fit_physics_from_images(
     noise = tracks_noise(capture, episodes)
     known = Noise(noise[0] or 0.0, noise[1] or 0.0)
     doubts = examine_tracks(world, [(episode.name, episode.tracks, known) for episode in episodes])
+    episodes, alike = _on_alike_sides(world, episodes, outlines, known)
     _require_shared_effects(world)
     start = fit_with_effects(world, [Episode(episode.name, episode.tracks) for episode in episodes], config, noise)
     clock.lap("dynamics")
@@ -105,10 +107,20 @@ def fit_physics_from_images(
     found = _refined_fit(estimate, start, refined, record)
     return replace(
         found,
-        warnings=(*found.warnings, *left_out, *doubts, *track_warnings(episodes)),
+        warnings=(*found.warnings, *left_out, *doubts, *alike, *track_warnings(episodes)),
         collision=_moved(model, problem.objective, refined),
         tracks={episode.name: episode.tracks for episode in episodes if episode.found is not None},
     )
+
+
+def _on_alike_sides(
+    world: World, episodes: list[VideoEpisode], outlines: Mapping[str, Mesh], noise: Noise
+) -> tuple[list[VideoEpisode], tuple[str, ...]]:
+    """Return the episodes whose poses masks alone gave, with one choice of the sides of a body that look the same."""
+    if not outlines or any(episode.found is None for episode in episodes):
+        return episodes, ()
+    turned, warnings = with_alike_sides(world, [Episode(one.name, one.tracks) for one in episodes], outlines, noise)
+    return [replace(one, tracks=other.tracks) for one, other in zip(episodes, turned, strict=True)], warnings
 
 
 def _record(
