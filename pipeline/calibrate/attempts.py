@@ -279,8 +279,8 @@ def _all_seen(mapped: Mapped) -> bool:
     return all(len(seen) for _, seen in mapped.model().observations.values())
 
 
-def _brightness(photo: Path) -> NDArray[np.float32]:
-    return cv2.cvtColor(read_rgb(photo), cv2.COLOR_RGB2GRAY).astype(np.float32)
+def _brightness(photo: Path) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(read_rgb(photo), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _with_principal_points(mapped: Mapped, camera_model: str, inputs: Inputs, seed: int) -> Mapped:

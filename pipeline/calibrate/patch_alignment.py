@@ -31,9 +31,9 @@ _RIDGE = 1e-4
 _CHUNK = 200  # patches: OpenCV takes images of at most 32767 rows
 
 
-def smoothed(pictures: Pictures) -> list[NDArray[np.float32]]:
+def smoothed(pictures: Sequence[NDArray]) -> list[NDArray[np.float32]]:
     """Return pictures as patches are compared in them."""
-    return [np.asarray(cv2.GaussianBlur(one, (0, 0), _SMOOTH_PX), np.float32) for one in pictures]
+    return [np.asarray(cv2.GaussianBlur(one.astype(np.float32), (0, 0), _SMOOTH_PX), np.float32) for one in pictures]
 
 
 def _sampled(pictures: Pictures, photo: Ids, xy_px: Array) -> Array:

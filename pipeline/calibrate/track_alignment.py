@@ -21,7 +21,7 @@ from .reconstruction import Array, SfmModel, distort
 
 Ids = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-Gray = Mapping[str, NDArray[np.float32]]
+Gray = Mapping[str, NDArray]
 """Brightness of each photo, shape (height, width)."""
 
 _LEAST_LIKE = (0.9, 0.95)
@@ -165,9 +165,7 @@ def _plane_maps(model: SfmModel, images: Sequence[str], seen: _Sightings, mean: 
     return maps
 
 
-def _aligned(
-    model: SfmModel, images: Sequence[str], photos: Sequence[NDArray[np.float32]], seen: _Sightings
-) -> tuple[Array, Mask]:
+def _aligned(model: SfmModel, images: Sequence[str], photos: Sequence[NDArray], seen: _Sightings) -> tuple[Array, Mask]:
     """Return the place of each sighting [px], shape (n, 2), and whether it was found there."""
     mean = _mean_views(model, images, seen)
     reference, maps = _references(model, images, seen, mean), _plane_maps(model, images, seen, mean)
