@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ..geometry.rotation import quat_turn
 from ..optimization.levenberg_marquardt import Solution
-from .innovations import MOST_NUMBERS, RESOLUTION_S, WHITE, CorrelatedNoise, NoiseModel, matern
+from .innovations import MOST_NUMBERS, RESOLUTION_S, WHITE, CorrelatedNoise, NoiseModel, matern, with_white
 from .observations import Observations
 from .segmentation import Segment
 from .thresholds import TRACK_THRESHOLDS
@@ -247,8 +247,7 @@ def _likelihoods_together(windows: Sequence[Windows], noises: Sequence[Correlate
 
     def covariance(w: Windows) -> Tensor:
         gap = torch.from_numpy(w.gaps_s)
-        alike = torch.stack([matern(gap, *law) for law in laws])[which]
-        found = share * alike + (1 - share) * torch.eye(gap.shape[1], dtype=torch.float64)
+        found = with_white(torch.stack([matern(gap, *law) for law in laws])[which], share)
         return found if w.timed is None else found + torch.diag_embed(torch.from_numpy(w.timed[:, :, 0]))
 
     return restricted_likelihoods(windows, covariance)

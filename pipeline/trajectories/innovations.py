@@ -91,6 +91,11 @@ def matern(gaps_s: Tensor, time_s: float, order: float) -> Tensor:
     return (1 + x + (x.square() / 3 if order > 2 else 0.0)) * torch.exp(-x)
 
 
+def with_white(alike: Tensor, share: float | Tensor) -> Tensor:
+    """Return correlations (..., n, n) of errors of which a share of the variance has those given, and the rest none."""
+    return share * alike + (1 - share) * torch.eye(alike.shape[-1], dtype=alike.dtype)
+
+
 def matern_by_time(gaps_s: Tensor, time_s: float, order: float) -> Tensor:
     """Return the derivative of :func:`matern` by the logarithm of its time; arguments as there."""
     x = (gaps_s * (FALLS[order] / time_s)).clamp_max(700.0)

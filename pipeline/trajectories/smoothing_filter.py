@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .correlated_noise import Windows, restricted_likelihoods, windows_of
-from .innovations import CorrelatedNoise, matern
+from .innovations import CorrelatedNoise, matern, with_white
 from .observations import Observations
 from .segmentation import Segment
 from .thresholds import TRACK_THRESHOLDS
@@ -69,9 +69,7 @@ def smoothing_filter(
     step_s = float(np.median([np.median(np.diff(w.times_s, axis=1)) for w in windows]))
 
     def plain(w: Windows) -> Tensor:
-        gap = torch.from_numpy(w.gaps_s)
-        alike = matern(gap, without.time_s, without.order)
-        return (without.share * alike + (1 - without.share) * torch.eye(gap.shape[1], dtype=torch.float64))[None]
+        return with_white(matern(torch.from_numpy(w.gaps_s), without.time_s, without.order), without.share)[None]
 
     found, most = None, restricted_likelihoods(windows, plain)[0][0] + LIMITS.sure_filter / 2
     for one, gain in _filters(step_s):
