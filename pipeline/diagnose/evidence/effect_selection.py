@@ -123,6 +123,7 @@ def select_next(
     equals = _equals(done, linear, kept, variants, dispersion)
     if flight.noise_model != WHITE:
         equals = _with_unproven(equals, done, linear.episode)
+    equals = _without_further(equals, linear, kept, variants, level, dispersion)
     equals = _simplest_within(equals, done, linear, kept, variants)
     told = len(equals) <= LIMITS.most_equals and not are_slight(equals)
     named = told and (
@@ -293,6 +294,41 @@ def _with_unproven(equals: Sequence[Evidence], done: Sequence[Evidence], episode
         if not differs and float(own.mean()) - more / len(own) <= LIMITS.paired_t * error:
             found.append(other)
     return sorted(found, key=_complexity)
+
+
+def _without_further(
+    equals: Sequence[Evidence],
+    linear: Linearization,
+    candidates: Sequence[Candidate],
+    variants: Sequence[Variant],
+    level: float,
+    dispersion: float,
+) -> list[Evidence]:
+    """Return the equals without effects that act beside the first one, for the next step to name.
+
+    Two effects that explain as much as each other are rivals where one shows no more beside the other. Where each is
+    significant beside the other, they explain different things, and both are needed.
+
+    Args:
+        equals: Effects that explain the data equally well, the first one to be named.
+        linear: The linearization.
+        candidates: The candidates.
+        variants: Their variants.
+        level: P-value below which an effect is significant.
+        dispersion: Factor by which variances exceed those of the noise.
+    """
+    columns = [linear.columns(_variant(one, candidates, variants).parameters) for one in equals]
+    base = list(range(linear.base))
+
+    def shows(one: list[int], beside: list[int]) -> bool:
+        return score_test(linear, one, [*base, *beside], dispersion).p_value < level
+
+    first = columns[0]
+    return [
+        one
+        for k, (one, own) in enumerate(zip(equals, columns, strict=True))
+        if k == 0 or not (shows(own, first) and shows(first, own))
+    ]
 
 
 def _simplest_within(
