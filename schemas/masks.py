@@ -20,9 +20,9 @@ class MasksReport(FileModel):
     """`masks.json`."""
 
     format: Literal["cgwm-masks/1"] = "cgwm-masks/1"
-    method: Literal["plain", "turntable", "box", "empty"]
-    """What told the body from the rest: a background of one colour, surroundings that stand, a box, or a film of the
-    empty place."""
+    method: Literal["opacity", "plain", "turntable", "box", "empty"]
+    """What told the body from the rest: the opacity of the photos, a background of one colour, surroundings that stand,
+    a box, or a film of the empty place."""
     body: str = ""
     """Name of the body; empty where the photos were not those of a capture with bodies."""
     label: int
@@ -40,6 +40,7 @@ class MasksReport(FileModel):
         """Return the summary that the command prints."""
         shares = sorted(photo.share for photo in self.photos.values())
         found = {
+            "opacity": "what is opaque in the photos",
             "plain": "what stands before a background of one colour",
             "turntable": "what turns before surroundings that stand",
             "box": "what is in the box, and looks alike in the other photos",

@@ -82,6 +82,19 @@ def read_alpha(path: Path | str) -> NDArray[np.uint8]:
     return image[..., 3]
 
 
+def cut_out(path: Path | str) -> NDArray[np.bool_] | None:
+    """Return where a picture is opaque, shape (height, width); None where it has no opacity or is opaque everywhere.
+
+    Raises:
+        InputDataError: If it is missing, truncated or not an image.
+    """
+    image = decoded(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 3 or image.shape[2] != 4:
+        return None
+    opaque = image[..., 3] > np.iinfo(image.dtype).max // 2
+    return None if opaque.all() else opaque
+
+
 def write_image(path: Path | str, array: NDArray[np.uint8], quality: int = 95) -> None:
     """Write RGB (height, width, 3) or labels (height, width), uint8, as PNG or JPEG by the suffix.
 

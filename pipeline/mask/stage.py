@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.exif import turned_as_file, turned_upright, upright_size
 from ...datasets.capture.files import entries_of
-from ...datasets.capture.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, image_size, read_rgb, write_image
+from ...datasets.capture.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, cut_out, image_size, read_rgb, write_image
 from ...datasets.io.atomic import new_directory
 from ...datasets.io.kinds import kind_of
 from ...datasets.io.outputs import reads
@@ -58,8 +58,9 @@ def mask(
 ) -> MasksReport:
     """Write masks of one body in photos: `<name>.png`, 0 behind the body, its label on it.
 
-    Without a box the body is what stands before a background of one colour, or what turns before surroundings that
-    stand (a turntable). With one, it is what the box holds in one photo; the other photos are cut by its colours.
+    Without a box the body is what is opaque in photos that another tool has cut out, what stands before a background of
+    one colour, or what turns before surroundings that stand (a turntable). With one, it is what the box holds in one
+    photo; the other photos are cut by its colours.
 
     Args:
         source: A capture, or a folder of photos.
@@ -83,8 +84,10 @@ def mask(
         reference = _reference(given, photo)
         if box is not None:
             _require_inside(given, reference, box)
-        small = [_upright(given.folder / name) for name in progress(given.names, "photos", unit="photo")]
-        method, masks = _masks(given, small, reference, box)
+        method, masks = "opacity", [] if box is not None else _opaque(given)
+        if not masks:
+            small = [_upright(given.folder / name) for name in progress(given.names, "photos", unit="photo")]
+            method, masks = _masks(given, small, reference, box)
         report = masks_report(method, given.body, given.label, given.names, masks)
         for name, found in zip(given.names, masks, strict=True):
             width, height = image_size(given.folder / name)
@@ -179,6 +182,17 @@ def _require_inside(given: _Photos, reference: int, box: tuple[float, float, flo
 def _shown_size(given: _Photos, photo: int) -> tuple[int, int]:
     path = given.folder / given.names[photo]
     return upright_size(path, image_size(path))
+
+
+def _opaque(given: _Photos) -> list[Mask]:
+    """Return where photos are opaque that were cut out by another tool; nothing where one was not."""
+    masks = []
+    for name in given.names:
+        opaque = cut_out(given.folder / name) if name.lower().endswith(".png") else None
+        if opaque is None:
+            return []
+        masks.append(turned_upright(given.folder / name, _reduced(255 * opaque.astype(np.uint8))) > 127)
+    return masks
 
 
 def _upright(path: Path) -> NDArray[np.uint8]:

@@ -68,6 +68,21 @@ def test_the_body_is_cut_out(tmp_path: Path, behind: str, box: None, method: str
     assert validate(tmp_path / "masks").faults == ()
 
 
+def test_photos_that_another_tool_has_cut_out_tell_the_body(tmp_path: Path) -> None:
+    photos, discs = scene("what moves")
+    (tmp_path / "photos").mkdir()
+    for k, (photo, disc) in enumerate(zip(photos, discs, strict=True)):
+        cut = np.dstack([photo[:, :, ::-1], np.where(disc, 255, 0).astype(np.uint8)])
+        cv2.imwrite(str(tmp_path / "photos" / f"{k}.png"), cut)
+    report = mask(tmp_path / "photos", tmp_path / "masks")
+    assert report.method == "opacity" and "what is opaque in the photos" in str(report)
+    for k, disc in enumerate(discs):
+        assert ((read_label(tmp_path / "masks" / f"{k}.png") > 0) == disc).all()
+    cv2.imwrite(str(tmp_path / "photos" / "9.png"), np.dstack([photos[0], np.full((HEIGHT, WIDTH), 255, np.uint8)]))
+    with pytest.raises(InputDataError, match="the photos do not tell the body"):  # one is not cut out
+        mask(tmp_path / "photos", tmp_path / "others")
+
+
 def turn(path: Path, orientation: int) -> None:
     """Give a JPEG an EXIF orientation."""
     entry = struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
