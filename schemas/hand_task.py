@@ -136,7 +136,7 @@ class HandPlannerSection(PlannerSection):
     """Sequences of commands that are compared for a plan; plans that come in time matter more than their number."""
     step_s: Step = 0.01
     """Largest time step of a prediction [s]; contacts are softened to it."""
-    patience_s: Positive = 2.0
+    patience_s: Positive = 1.0
     """Time without coming nearer to a random goal after which plans are twice as long, until the object does [s]."""
     risk: Literal["likely", "mean", "worst_quarter"] = "likely"
     """What counts of several draws of the model (--draws): the draw whose predictions of the motion seen until now were
