@@ -49,7 +49,7 @@ def test_fit_names_spheres_and_size(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(NotEnoughMemoryError) as caught:
         fitting.fit(tmp_path, tmp_path / "model", "sg-gs", splat_config=config)
     assert str(caught.value) == (
-        "The memory did not suffice on the device 'cpu': 100000 spheres of the background, 2500 a body, photos at "
+        "The memory did not suffice on the device 'cpu': 100000 spheres of the background, 4000 a body, photos at "
         "960 px.\nNext: fewer spheres (--spheres N), smaller photos (--set sg-gs.image_size=N)."
     )
     assert not (tmp_path / "model").exists()
