@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -182,6 +182,12 @@ def _constants(variant: Variant) -> list[Parameter]:
         )
         for constant in effect.constants
     ]
+
+
+def with_added(world: World, effect: Effect, values: Mapping[str, float] | None = None) -> World:
+    """Return the world with one more effect; values that are not given are neutral."""
+    active = ActiveEffect.of(effect, values, world.gravity[0, :1])
+    return replace(world, effects=(*world.effects, active))
 
 
 def without_effects(world: World, *names: str) -> World:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,9 +19,9 @@ from torch import Tensor
 
 from ..optimization.tails import student_quantile
 from ..optimization.uncertainty import REACH, few_covariance, inverse
-from ..physics.effects.effect import ActiveEffect
 from ..physics.effects.registry import load_effect
 from ..physics.parameters import Parameter, effect_parameters
+from .candidates import with_added
 from .segment_fit import linearised
 from .segments import Segments
 from .thresholds import SEGMENT_THRESHOLDS
@@ -94,8 +94,7 @@ def beside_sessions(
         return None
     scale = copy.copy(load_effect("length_scale"))
     scale.name = NAME  # pyright: ignore[reportAttributeAccessIssue]
-    active = ActiveEffect.of(scale, {}, flight.world.gravity[0, :1])
-    world = replace(flight.world, effects=(*flight.world.effects, active))
+    world = with_added(flight.world, scale)
     column = next(p for p in effect_parameters(world) if p.name.partition(".")[0] == NAME)
     linear = linearised(flight.in_world(world), [*parameters, column], torch.cat((values, values.new_zeros(1))))
     joint = _joined(linear.information.numpy() / excess, linear.score.numpy() / excess, episodes, own, parameters)

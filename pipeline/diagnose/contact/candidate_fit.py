@@ -23,11 +23,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...physics.effects.effect import ActiveEffect
 from ...physics.parameters import Parameter, apply_parameters
 from ...physics.state import State
 from ...physics.world import World
-from ...segments.candidates import base_parameters, base_values
+from ...segments.candidates import base_parameters, base_values, with_added
 from ...segments.linearization import Linearization, linearize
 from ...segments.segment_fit import robust_excess
 from ...segments.segment_states import costs_of, fit_states
@@ -156,8 +155,7 @@ def _place(contact: Segments, world: World, evidence: Evidence | None) -> _Place
     own: tuple[Parameter, ...] = ()
     if evidence is not None:
         effect = evidence.candidate.effect
-        active = ActiveEffect.of(effect, evidence.constants, world.gravity[0, :1])
-        world = replace(world, effects=(*world.effects, active))
+        world = with_added(world, effect, evidence.constants)
         own = tuple(p for p in base_parameters(world, "contact") if p.name.startswith(f"{effect.name}."))
     parameters = (*nuisance, *own)
     centre = base_values(world, parameters)

@@ -16,9 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from ...optimization.tails import chi2_tail
-from ...physics.effects.effect import ActiveEffect
 from ...physics.world import World
-from ...segments.candidates import Candidate, Variant, variants_of
+from ...segments.candidates import Candidate, Variant, variants_of, with_added
 from ...segments.prepare import Prepared
 from ...segments.segments import Segments
 from ...segments.sliding.fit import StartedSliding
@@ -234,8 +233,7 @@ def ranked(evidence: Iterable[Evidence]) -> list[Evidence]:
 def with_effect(world: World, found: Evidence) -> World:
     """Return the world with an effect, and with the contact parameters that were fitted jointly with it."""
     values = found.constants | {name: value for name, (value, _) in found.estimates.items()}
-    active = ActiveEffect.of(found.candidate.effect, values, world.gravity[0, :1])
     law = vars(world.contact)
     fitted = {name: torch.full_like(law[name], value) for name, value in found.contact.items()}
     contact = replace(world.contact, **fitted) if fitted else world.contact
-    return replace(world, contact=contact, effects=(*world.effects, active))
+    return with_added(replace(world, contact=contact), found.candidate.effect, values)

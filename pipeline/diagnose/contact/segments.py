@@ -24,9 +24,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...physics.effects.effect import ActiveEffect
 from ...physics.world import World
-from ...segments.candidates import Candidate, Variant, base_parameters, base_values
+from ...segments.candidates import Candidate, Variant, base_parameters, base_values, with_added
 from ...segments.linearization import Linearization, linearize
 from ...segments.segment_fit import refit
 from ...segments.segment_states import fit_states
@@ -261,10 +260,7 @@ def _judged(
 def _refitted(world: World, contact: Segments, evidence: Evidence) -> tuple[World, dict[str, tuple[float, float]]]:
     """Return the world with an effect refitted in contact, and its parameters with estimate and standard error."""
     effect = evidence.candidate.effect
-    added = replace(
-        world,
-        effects=(*world.effects, ActiveEffect.of(effect, evidence.constants, world.gravity[0, :1])),
-    )
+    added = with_added(world, effect, evidence.constants)
     parameters = [
         p for p in base_parameters(added, "contact") if "." not in p.name or p.name.startswith(f"{effect.name}.")
     ]

@@ -15,8 +15,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from ...physics.effects.effect import ActiveEffect
-from ...segments.candidates import Candidate, Variant, with_variants
+from ...segments.candidates import Candidate, Variant, with_added, with_variants
 from ...segments.sliding.descent import SlidingFit, information_by_segment
 from ...segments.sliding.fit import StartedSliding, fit_sliding, nuisance_parameters
 from ...segments.sliding.variant_fits import fits_of_variants
@@ -168,7 +167,7 @@ def pyramid_share(started: StartedSliding, variant: Variant, fit: SlidingFit, ba
         base: Smallest chi2 without either.
     """
     soft = started.segments.world
-    world = replace(soft, effects=(*soft.effects, ActiveEffect.of(FrictionPyramid(), {}, soft.gravity[0, :1])))
+    world = with_added(soft, FrictionPyramid())
     own = fit.values[0, : fit.values.shape[1] - len(variant.parameters)]
     found = fit_sliding(world, [], [(fit.segments.in_world(world), own)], started.flight_parameters)[0]
     return (base - found.cost) / max(base - fit.cost, 1e-9)

@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...physics.effects.effect import ActiveEffect
 from ...physics.parameters import Parameter
 from ...physics.world import World
-from ...segments.candidates import Candidate, Variant, acts_in, admissible, base_parameters, variants_of
+from ...segments.candidates import Candidate, Variant, acts_in, admissible, base_parameters, variants_of, with_added
 from ...segments.linearization import Linearization
 from ...segments.segment_fit import Refit, refit
 from ...segments.segments import Segments
@@ -221,8 +220,7 @@ def refitted(
         dispersion: Factor by which variances exceed those of the noise.
     """
     effect = evidence.candidate.effect
-    like = world.gravity[0, :1]
-    added = replace(world, effects=(*world.effects, ActiveEffect.of(effect, evidence.constants, like)))
+    added = with_added(world, effect, evidence.constants)
     kinds = {part.kind for part in parts}
     parameters = base_parameters(added, "contact" if "contact" in kinds else "flight")
     own = [p for p in parameters if p.name.partition(".")[0] == effect.name]

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 from ...optimization.tails import student_tail
 from ...physics.parameters import effect_parameters
 from ...physics.world import World
-from ...segments.candidates import Candidate, Variant, admissible, base_parameters, variants_of, without_effects
+from ...segments.candidates import (
+    Candidate,
+    Variant,
+    admissible,
+    base_parameters,
+    variants_of,
+    with_added,
+    without_effects,
+)
 from ...segments.linearization import Linearization, linearize
 from ...segments.prepare import Prepared
 from ...segments.segment_fit import refit
@@ -27,7 +35,7 @@ from ..evidence.effect_selection import SelectionStep
 from ..evidence.evidence import Evidence, prior_odds
 from ..evidence.score_test import canonical_correlation, solved
 from ..thresholds import THRESHOLDS
-from .specific_values import encoded, parameters_of, specific_evidence, values_of_each, with_neutral, with_specific
+from .specific_values import encoded, parameters_of, specific_evidence, values_of_each, with_specific
 
 LIMITS = THRESHOLDS.flight
 
@@ -321,7 +329,7 @@ def _refitted(
     candidate: Candidate, world: World, flight: Segments, groups: NDArray[np.int64], start: dict[int, Array]
 ) -> tuple[dict[int, Array], Array, float]:
     """Return an effect's parameters by group, the chi2 of each flight (B,), and that of all with one value for all."""
-    added = with_neutral(world, candidate.effect)
+    added = with_added(world, candidate.effect)
     own = parameters_of(added, candidate.effect.name)
     alone = refit([flight], added, own, encoded(own, np.mean(list(start.values()), axis=0), flight))
     return *values_of_each(candidate.effect, world, flight, groups, start), alone.cost

@@ -23,7 +23,7 @@ from ...physics.effects.effect import ActiveEffect
 from ...physics.effects.registry import load_effect
 from ...physics.parameters import Parameter
 from ...physics.world import World
-from ...segments.candidates import Candidate, base_parameters, without_effects
+from ...segments.candidates import Candidate, base_parameters, with_added, without_effects
 from ...segments.prepare import Prepared, whole_flights
 from ...segments.segment_fit import linearised, refit
 from ...segments.segment_states import fit_states
@@ -32,7 +32,7 @@ from ...trajectories.innovations import WHITE
 from ..evidence.cross_validation import ITERATIONS, KNOWN_SHARE, continued
 from ..evidence.effect_selection import SelectionStep
 from ..thresholds import THRESHOLDS
-from .specific_values import parameters_of, specific_evidence, with_neutral, with_specific
+from .specific_values import parameters_of, specific_evidence, with_specific
 
 LIMITS = THRESHOLDS.verdict
 
@@ -199,4 +199,4 @@ def _by_flights(whole: Segments, name: str) -> tuple[dict[int, Array], float]:
 
 def _with(world: World, name: str) -> World:
     """Return a world with an effect at neutral; itself for an empty name."""
-    return with_neutral(world, load_effect(name)) if name else world
+    return with_added(world, load_effect(name)) if name else world

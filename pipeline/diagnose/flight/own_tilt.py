@@ -16,7 +16,7 @@ from ...optimization.tails import chi2_tail
 from ...physics.effects.effect import ActiveEffect
 from ...physics.effects.registry import load_effect
 from ...physics.world import World
-from ...segments.candidates import Candidate, base_parameters, variants_of, without_effects
+from ...segments.candidates import Candidate, base_parameters, variants_of, with_added, without_effects
 from ...segments.flights.residual_wrench import residual_wrenches
 from ...segments.flights.slow_errors import SlowErrors
 from ...segments.linearization import linearize
@@ -162,7 +162,7 @@ def own_tilt_step(
     """
     names = _missing(world, candidates)
     std = slow.sway_m_s2(prepared.noise.position_m) / float(world.gravity[0].norm())
-    tilted = replace(world, effects=(*world.effects, ActiveEffect.of(load_effect(names[0]), {}, world.gravity[0, :1])))
+    tilted = with_added(world, load_effect(names[0]))
     found = refit([flight], tilted, base_parameters(tilted, "flight"))
     mean = {name: found.number(f"{names[0]}.{name}") for name in ("tilt_x", "tilt_y")}
     evidence = [_evidence(name, std, mean, slow.sway_evidence) for name in names]

@@ -11,22 +11,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...optimization.tails import chi2_tail
-from ...physics.effects.effect import ActiveEffect, Effect
+from ...physics.effects.effect import Effect
 from ...physics.effects.registry import load_effect
 from ...physics.parameters import Parameter, effect_parameters
 from ...physics.world import World
-from ...segments.candidates import Candidate
+from ...segments.candidates import Candidate, with_added
 from ...segments.segment_fit import refit
 from ...segments.segments import Segments
 from ..evidence.evidence import Evidence
 from ..evidence.score_test import ScoreTest
 
 Array = NDArray[np.float64]
-
-
-def with_neutral(world: World, effect: Effect) -> World:
-    """Return a world with an effect at neutral."""
-    return replace(world, effects=(*world.effects, ActiveEffect.of(effect, {}, world.gravity[0, :1])))
 
 
 def parameters_of(world: World, name: str) -> list[Parameter]:
@@ -48,12 +43,11 @@ def with_specific(
     """
     effect = load_effect(spec)
     names = [parameter.name for parameter in effect.parameters]
-    active = ActiveEffect.of(effect, dict(zip(names, mean.tolist(), strict=True)), world.gravity[0, :1])
     own = dict(world.own_values)
     for episode, mine in values.items():
         numbers = {f"{effect.name}.{name}": float(value) for name, value in zip(names, mine, strict=True)}
         own[episode] = {**own.get(episode, {}), **numbers}
-    world = replace(world, effects=(*world.effects, active), own_values=own)
+    world = with_added(replace(world, own_values=own), effect, dict(zip(names, mean.tolist(), strict=True)))
     return world, replace(flight, observations=flight.observations.with_own(world)).in_world(world)
 
 
@@ -69,7 +63,7 @@ def values_of_each(
         units: Group or episode of each flight (B,).
         start: Parameters (k,) of each unit to start from.
     """
-    added = with_neutral(world, effect)
+    added = with_added(world, effect)
     own = parameters_of(added, effect.name)
     values, cost = {}, np.zeros(len(units))
     for unit, value in start.items():

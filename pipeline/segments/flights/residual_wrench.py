@@ -25,6 +25,7 @@ from ...trajectories.innovations import WHITE, NoiseModel
 from ...trajectories.observations import Observations
 from ...trajectories.segmentation import Segment
 from ...trajectories.track_noise import Noise
+from ..candidates import with_added
 from ..segment_fit import linearised
 from ..segment_states import fit_states
 from ..segments import Segments
@@ -123,8 +124,7 @@ class Covariate:
 
 def residual_wrenches(segments: Segments) -> ResidualWrenches:
     """Return the residual wrench of each fitted segment of one free body."""
-    active = ActiveEffect.of(ResidualWrench(), like=segments.world.gravity[0, :1])
-    world = replace(segments.world, effects=(*segments.world.effects, active))
+    world = with_added(segments.world, ResidualWrench())
     parameters = [p for p in effect_parameters(world) if p.name.startswith(f"{ResidualWrench.name}.")]
     linear = linearised(
         replace(segments, world=world), parameters, torch.zeros(len(parameters)).to(segments.world.gravity)
