@@ -64,7 +64,7 @@ def few_covariance(information: Array, scores: Array, prior: Array | None = None
         sizes, directions = np.linalg.eigh(prior)
         parts.append(curvature @ (directions * np.sqrt(sizes.clip(0.0))))
     scatter = sum((part @ part.T for part in parts), np.zeros_like(curvature))
-    return scatter if count >= ENOUGH_EPISODES else _wider(curvature, scatter)
+    return scatter if count >= ENOUGH_EPISODES else raised(curvature, scatter)
 
 
 def student_reach(information: Array, covariance: Array) -> Array:
@@ -86,7 +86,7 @@ def student_reach(information: Array, covariance: Array) -> Array:
     return np.array([max(student_quantile(0.975, float(n)) / usual, 1.0) for n in dof])
 
 
-def _wider(covariance: Array, other: Array) -> Array:
+def raised(covariance: Array, other: Array) -> Array:
     """Return a covariance (P, P) with variances raised to those of another where larger, and unchanged correlations."""
     width = np.sqrt(np.maximum(1.0, np.diag(other) / np.diag(covariance).clip(1e-300)))
     return covariance * np.outer(width, width)

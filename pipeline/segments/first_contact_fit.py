@@ -20,7 +20,7 @@ from ...datasets.capture.tracks import Episode
 from ...schemas import Correlation, FittedParameter
 from ..optimization.levenberg_marquardt import Solution, minimise
 from ..optimization.tails import student_quantile
-from ..optimization.uncertainty import ENOUGH_EPISODES, REACH, _wider, correlation_of, few_covariance, inverse
+from ..optimization.uncertainty import ENOUGH_EPISODES, REACH, correlation_of, few_covariance, inverse, raised
 from ..physics.parameters import Parameter, apply_parameters
 from ..physics.world import World
 from ..trajectories.correlated_noise import ROBUST_SCALE, WindowErrors
@@ -189,7 +189,7 @@ def _covariance(solution: Solution, residuals: TrajectoryResiduals, whole_flight
         return covariance
     factor, dof = error_factor(residuals, solution)
     missed = factor * (student_quantile(0.975, dof) / REACH) ** 2 * inverse(solution.information.numpy())
-    return _wider(covariance, missed)
+    return raised(covariance, missed)
 
 
 def error_factor(residuals: TrajectoryResiduals, solution: Solution) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...optimization.tails import student_quantile
-from ...optimization.uncertainty import REACH, inverse
+from ...optimization.uncertainty import REACH, inverse, raised
 from .contrasts import KEPT
 
 Array = NDArray[np.float64]
@@ -43,8 +43,7 @@ def no_narrower(covariance: Array, rows: Tensor, jacobian: Tensor, prior: Array)
     excess, counts = _turned(along, left, states.unflatten(1, (-1, 6)), (rows != 0).any(1))
     reach = np.array([student_quantile(0.975, max(float(n), 1.0)) / REACH for n in counts])
     least = np.diag(curvature) * excess.numpy() * reach**2
-    width = np.sqrt(np.maximum(1.0, least / np.diag(covariance).clip(1e-300)))
-    return covariance * np.outer(width, width)
+    return raised(covariance, np.diag(least))
 
 
 def _basis(columns: Tensor) -> Tensor:
