@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from .articulations import Articulation
 from .base import FileModel
@@ -233,42 +233,41 @@ _LEAST_LENGTH_M, _MOST_MARKER_M, _MOST_DISTANCE_M = 0.002, 3.0, 50.0
 """Lengths of the sources of scale that are not taken for those in another unit [m]."""
 
 
-def _in_metres(length_m: float, what: str, most_m: float) -> float:
-    """Return a length that a scene on a table or in a room may have; refuse others, which are in another unit."""
-    if not _LEAST_LENGTH_M <= length_m <= most_m:
-        hint = f"; {length_m / 1000.0:g} if these are millimetres" if length_m > most_m else ""
-        raise ValueError(f"{what} of {length_m:g} m; lengths are in metres, {_LEAST_LENGTH_M:g} to {most_m:g}{hint}")
-    return length_m
+def _in_metres(what: str, most_m: float) -> AfterValidator:
+    """Return a check that a scene on a table or in a room may have a length; others are in another unit."""
+
+    def checked(length_m: float) -> float:
+        if not _LEAST_LENGTH_M <= length_m <= most_m:
+            hint = f"; {length_m / 1000.0:g} if these are millimetres" if length_m > most_m else ""
+            limits = f"{_LEAST_LENGTH_M:g} to {most_m:g}"
+            raise ValueError(f"{what} of {length_m:g} m; lengths are in metres, {limits}{hint}")
+        return length_m
+
+    return AfterValidator(checked)
+
+
+_Side = Annotated[Length, _in_metres("a marker", _MOST_MARKER_M)]
+_Distance = Annotated[Length, _in_metres("a distance", _MOST_DISTANCE_M)]
 
 
 class Marker(FileModel):
     """An ArUco marker of known size that is visible in the photos."""
 
     id: Annotated[int, Field(ge=0, le=100_000)]
-    side_m: Length
+    side_m: _Side
     """Length of the black square's side [m]."""
     pose: Pose | None = None
     """T_world_marker (x right, y up as printed, z out of the paper); fixes the world frame where given."""
-
-    @field_validator("side_m")
-    @classmethod
-    def _side_in_metres(cls, side_m: float) -> float:
-        return _in_metres(side_m, "a marker", _MOST_MARKER_M)
 
 
 class KnownDistance(FileModel):
     """A known distance between two points that are marked in at least two photos each."""
 
-    distance_m: Length
+    distance_m: _Distance
     a_px: dict[str, tuple[Pixel, Pixel]]
     """Photo (path relative to images/) to pixel (x, y) of the first point; top-left pixel centre is (0.5, 0.5)."""
     b_px: dict[str, tuple[Pixel, Pixel]]
     """The same for the second point."""
-
-    @field_validator("distance_m")
-    @classmethod
-    def _distance_in_metres(cls, distance_m: float) -> float:
-        return _in_metres(distance_m, "a distance", _MOST_DISTANCE_M)
 
     @model_validator(mode="after")
     def _two_views(self) -> KnownDistance:
@@ -281,14 +280,9 @@ class KnownDistance(FileModel):
 class KnownCameraDistance(FileModel):
     """A known distance between the optical centres of two photos."""
 
-    distance_m: Length
+    distance_m: _Distance
     images: tuple[str, str]
     """The two photos (paths relative to images/)."""
-
-    @field_validator("distance_m")
-    @classmethod
-    def _distance_in_metres(cls, distance_m: float) -> float:
-        return _in_metres(distance_m, "a distance", _MOST_DISTANCE_M)
 
 
 class Calibration(FileModel):

@@ -31,7 +31,7 @@ from .mapping import (
     with_principal_points,
     without_outliers,
 )
-from .photos import Inputs
+from .photos import Inputs, video_of
 from .pose_posterior import principal_points
 from .reconstruction import SfmModel, VerifiedPair
 from .track_alignment import aligned
@@ -384,7 +384,7 @@ def photo_count(model: SfmModel, inputs: Inputs) -> int:
 
 def photo_labels(inputs: Inputs) -> list[str]:
     """Return the labels of the photos, without frames of videos."""
-    return [source.label for source in inputs.sources if not source.image.name.startswith("videos/")]
+    return [source.label for source in inputs.sources if video_of(source.label) is None]
 
 
 def _needed(inputs: Inputs) -> int:

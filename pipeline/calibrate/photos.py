@@ -68,9 +68,17 @@ class Inputs:
     """Intrinsics of cameras that are given and not estimated."""
 
 
+_VIDEO = "video:"
+
+
 def video_label(camera: str) -> str:
     """Return the label of the frame of a video camera, which is distinct from all names of photos."""
-    return f"video:{camera}"
+    return f"{_VIDEO}{camera}"
+
+
+def video_of(label: str) -> str | None:
+    """Return the camera whose frame of a video a label names; None for a photo."""
+    return label.removeprefix(_VIDEO) if label.startswith(_VIDEO) else None
 
 
 def gather(capture: Capture, folder: Path, intrinsics: Path | None = None, turntable: bool | None = None) -> Inputs:
@@ -151,8 +159,8 @@ def _known(capture: Capture, sources: Sequence[Source], root: Path, file: Path |
     Raises:
         InputDataError: If some are of a size that nothing has.
     """
-    videos = [source.image for source in sources if source.label.startswith(video_label(""))]
-    photos = [source for source in sources if not source.label.startswith(video_label(""))]
+    videos = [source.image for source in sources if video_of(source.label) is not None]
+    photos = [source for source in sources if video_of(source.label) is None]
     sizes = {source.image.camera: image_size(capture.root / "images" / source.label) for source in photos}
     frames = {image.camera: image_size(root / image.name) for image in videos}
     sizes |= {camera: size for camera, size in frames.items() if size not in sizes.values()}

@@ -46,7 +46,7 @@ from .folded_cameras import folded_sides
 from .given_intrinsics import read_intrinsics
 from .markers import detect_markers, dictionary
 from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
-from .photos import Inputs, gather, video_label
+from .photos import Inputs, gather, video_of
 from .reconstruction import Array, SfmCamera, SfmModel, Similarity, world_from_cam
 from .turntable_motion import TurntableMotion
 from .world_frame import dominant_plane, ground_frame, upright_frame
@@ -249,10 +249,9 @@ def _cameras_file(model: SfmModel, scale: Scale) -> CamerasFile:
     for label in sorted(model.T_cam_world):
         rows = tuple(tuple(float(x) for x in row) for row in world_from_cam(model.T_cam_world[label]))
         camera = model.image_camera[label]
-        if label.startswith(video_label("")):
-            videos[label.removeprefix(video_label(""))] = PosedVideo.model_validate(
-                {"camera": camera, "T_world_cam": rows}
-            )
+        video = video_of(label)
+        if video is not None:
+            videos[video] = PosedVideo.model_validate({"camera": camera, "T_world_cam": rows})
         else:
             images[label] = PosedImage.model_validate({"camera": camera, "T_world_cam": rows})
     cameras = {name: _intrinsics(camera) for name, camera in sorted(model.cameras.items())}
@@ -291,9 +290,7 @@ def _report(
         for source in inputs.sources
     }
     photos = photo_labels(inputs)
-    videos = {
-        label.removeprefix(video_label("")): verdict for label, verdict in verdicts.items() if label not in photos
-    }
+    videos = {video: one for label, one in verdicts.items() if (video := video_of(label)) is not None}
     videos |= {camera: ImageVerdict(registered=False, reason=reason) for camera, reason in inputs.moving.items()}
     tilt, height = _ground_check(capture, model, scale)
     return CalibrationReport(
@@ -368,10 +365,10 @@ def _wrong_exif(best: Candidate) -> list[str]:
 
 
 def _uncertain_centers(stds_percent: dict[str, float]) -> list[str]:
-    limit, prefix = 100.0 * UNCERTAIN_CENTER, video_label("")
+    limit = 100.0 * UNCERTAIN_CENTER
     uncertain = {image: std for image, std in stds_percent.items() if std > limit}
-    videos = {image.removeprefix(prefix): std for image, std in uncertain.items() if image.startswith(prefix)}
-    photos = {image: std for image, std in uncertain.items() if not image.startswith(prefix)}
+    videos = {video: std for image, std in uncertain.items() if (video := video_of(image)) is not None}
+    photos = {image: std for image, std in uncertain.items() if video_of(image) is None}
     warnings = []
     if photos:
         worst = max(photos, key=lambda image: photos[image])
@@ -413,7 +410,7 @@ def _warnings(best: Candidate) -> list[str]:
             f"the images fall into parts that share too few points: the largest, of {len(best.model.T_cam_world)}, is "
             f"taken; {sizes} images are in others"
         )
-    photos = sorted(name for name in best.model.T_cam_world if not name.startswith(video_label("")))
+    photos = sorted(name for name in best.model.T_cam_world if video_of(name) is None)
     if (sides := folded_sides(best.model, photos)) > 1:
         others = "another" if sides == 2 else f"{sides - 1} others"
         warnings.append(
