@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -64,6 +64,16 @@ def read_label(path: Path | str) -> NDArray[np.uint8]:
             "save it as an 8-bit greyscale PNG.",
         )
     return image
+
+
+def named_as_photo(path: Path) -> bool:
+    """Return whether a file is called as a picture is, of a kind that is read or of another one."""
+    return path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREAD_SUFFIXES)
+
+
+def unread_kinds(paths: Iterable[Path]) -> list[str]:
+    """Return the suffixes of pictures that are not read among files, in order."""
+    return sorted({path.suffix for path in paths if path.suffix.lower() in UNREAD_SUFFIXES})
 
 
 def read_alpha(path: Path | str) -> NDArray[np.uint8]:

@@ -17,13 +17,22 @@ from ...schemas.imports import ImportResult
 from ...schemas.printable import typed_path
 from ...schemas.regular_files import require_regular_file
 from ..capture.files import entries_of
-from ..capture.images import HEIF_BRANDS, IMAGE_SUFFIXES, PNG_SIGNATURE, UNREAD_SUFFIXES, image_size, write_image
+from ..capture.images import (
+    HEIF_BRANDS,
+    IMAGE_SUFFIXES,
+    PNG_SIGNATURE,
+    UNREAD_SUFFIXES,
+    image_size,
+    named_as_photo,
+    write_image,
+)
 from ..capture.manifest import write_manifest
+from ..capture.video import VIDEO_SUFFIXES
 from ..io.progress import progress
 
 HEIF_SUFFIXES = (".heic", ".heif")
 """Suffixes of photos that are converted, in lower case."""
-_VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".webm", ".avi", ".mkv")
+_VIDEO_SUFFIXES = (*VIDEO_SUFFIXES, ".m4v", ".avi", ".mkv")
 _QUALITY = 97
 """JPEG quality of a converted photo: what it loses lies below the noise of the sensor."""
 
@@ -100,8 +109,7 @@ def _require_folder(folder: Path) -> None:
         return
     is_file = folder.is_file()
     todo = "name the folder that holds the photos"
-    is_photo = folder.suffix.lower() in (*IMAGE_SUFFIXES, *UNREAD_SUFFIXES)
-    todo += "." if is_photo else f" (a video: cgwm import video {typed_path(folder)})."
+    todo += "." if named_as_photo(folder) else f" (a video: cgwm import video {typed_path(folder)})."
     raise InputDataError(
         f"{folder}: {'is a file' if is_file else 'no such folder'}.",
         "a folder of photos.",

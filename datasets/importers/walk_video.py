@@ -14,7 +14,7 @@ from ...schemas import InputDataError
 from ...schemas.imports import ImportResult
 from ...schemas.printable import typed_path
 from ...schemas.regular_files import require_regular_file
-from ..capture.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, write_image
+from ..capture.images import named_as_photo, write_image
 from ..capture.video import frames_of
 from ..io.atomic import new_directory
 from ..io.outputs import reads
@@ -75,7 +75,7 @@ def import_video(source: Path | str, out: Path | str, photos: int = 60, overwrit
 
 def _require_video(source: Path) -> None:
     """Refuse a folder, and a photo."""
-    is_photo = source.suffix.lower() in (*IMAGE_SUFFIXES, *UNREAD_SUFFIXES)
+    is_photo = named_as_photo(source)
     if source.is_dir() or (is_photo and source.is_file()):
         folder = source.parent if is_photo else source
         raise InputDataError(

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...datasets.capture.exif import photo_lens
 from ...datasets.capture.files import entries_of
-from ...datasets.capture.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, read_rgb
+from ...datasets.capture.images import IMAGE_SUFFIXES, read_rgb, unread_kinds
 from ...datasets.io.atomic import new_file
 from ...datasets.io.outputs import reads
 from ...datasets.io.progress import progress
@@ -106,7 +106,7 @@ def _measured(folder: Path) -> IntrinsicsFile:
     entries = entries_of(folder)
     names = [path.name for path in entries if path.suffix.lower() in IMAGE_SUFFIXES]
     if len(names) < MIN_PHOTOS:
-        unread = sorted({path.suffix for path in entries if path.suffix.lower() in UNREAD_SUFFIXES})
+        unread = unread_kinds(entries)
         raise InputDataError(
             f"{folder}: {len(names)} photo(s)" + (f", and files {', '.join(unread)}." if unread else "."),
             f"at least {MIN_PHOTOS} photos of the board, .jpg or .png.",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...datasets.capture.capture import Capture
 from ...datasets.capture.exif import turned_as_file, turned_upright, upright_size
 from ...datasets.capture.files import entries_of
-from ...datasets.capture.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, cut_out, image_size, read_rgb, write_image
+from ...datasets.capture.images import IMAGE_SUFFIXES, cut_out, image_size, read_rgb, unread_kinds, write_image
 from ...datasets.io.atomic import new_directory
 from ...datasets.io.kinds import kind_of
 from ...datasets.io.outputs import reads
@@ -129,7 +129,7 @@ def _photos(source: Path, body: str | None) -> _Photos:
 
 def _no_photos(folder: Path) -> InputDataError:
     """Return the error of a folder without photos that are read."""
-    unread = sorted({path.suffix for path in entries_of(folder) if path.suffix.lower() in UNREAD_SUFFIXES})
+    unread = unread_kinds(entries_of(folder))
     return InputDataError(
         f"{folder}: no photos" + (f", but files {', '.join(unread)}." if unread else "."),
         "photos .jpg, .jpeg or .png.",
