@@ -31,7 +31,8 @@ def on_the_ground(world: World, prepared: Prepared) -> tuple[World, Prepared]:
     if len(kept) < len(items):
         said = (
             f"{len(items) - len(kept)} of {len(items)} pieces of contact touch fixed surfaces; effects of contact are "
-            "examined in the others, on the ground."
+            "examined in the others, on the ground. Motions to record next are proposed as if there were no surfaces: "
+            "make them where there is room."
         )
         found = replace(found, warnings=(*found.warnings, said))
     return replace(world, surfaces=()), found
