@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from cgwm.pipeline.calibrate import calibrate
-from cgwm.pipeline.calibrate.metric_scale import umeyama
+from cgwm.pipeline.calibrate.world_frame.metric_scale import umeyama
 from cgwm.schemas import CalibrateConfig, CamerasFile, read_json
 from store import Store, shared_data
 

@@ -34,8 +34,8 @@ import pycolmap
 from calibrate import make_capture
 from cgwm.pipeline.calibrate import calibrate
 from cgwm.pipeline.calibrate.center_uncertainty import UNCERTAIN_CENTER
-from cgwm.pipeline.calibrate.metric_scale import umeyama
 from cgwm.pipeline.calibrate.stage import UNCERTAIN_ROTATION_DEG
+from cgwm.pipeline.calibrate.world_frame.metric_scale import umeyama
 from cgwm.schemas import CalibrateConfig, CalibrationReport, CamerasFile, NotConvergedError, read_json
 from mesh_photos import scanned
 from object_photos import Session, photograph, poses, write_photos

@@ -80,7 +80,7 @@ def _printed(sheet: TargetSheet) -> str:
 
 
 def _use(folder: Path) -> str:
-    from ..pipeline.calibrate.target import INTRINSICS_NAME
+    from ..pipeline.calibrate.target.intrinsics import INTRINSICS_NAME
     from ..schemas.printable import typed_path
 
     return f"use them: cgwm calibrate CAPTURE --intrinsics {typed_path(folder / INTRINSICS_NAME)}"

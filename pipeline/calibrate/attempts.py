@@ -16,12 +16,10 @@ from ...datasets.capture.images import read_rgb
 from ...datasets.io.processors import processors
 from ...schemas import CalibrateConfig, NotConvergedError
 from ...schemas.calibration import CalibrationAttempt, ImageVerdict, PairFigures, SelfCheckFigures
-from . import colmap
 from .camera_models import FIRST_TRIED, LADDER, richer, supported
 from .center_uncertainty import center_stds, focal_stds
-from .consistency_check import SelfCheck, check_model
-from .focal_prior import EXIF_STD, FocalLength, focal_lengths
-from .mapping import (
+from .colmap.features import SfmSettings, build_database, exif_focals_px, feature_counts, read_pairs
+from .colmap.mapping import (
     Mapped,
     adjusted,
     adjusts_without_blas,
@@ -31,13 +29,15 @@ from .mapping import (
     with_principal_points,
     without_outliers,
 )
+from .consistency_check import SelfCheck, check_model
+from .focal_prior import EXIF_STD, FocalLength, focal_lengths
 from .photos import Inputs, video_of
 from .pose_posterior import principal_points
 from .reconstruction import SfmModel, VerifiedPair
 from .track_alignment import aligned
 from .turned_on_the_spot import turned_on_the_spot
-from .turntable_cameras import TurntableCameras, on_turntable
-from .turntable_motion import TurntableMotion
+from .turntable.cameras import TurntableCameras, on_turntable
+from .turntable.motion import TurntableMotion
 
 MIN_PHOTOS = 3
 """Minimum number of photos, and of registered ones."""
@@ -100,7 +100,7 @@ def search(folder: Path, inputs: Inputs, config: CalibrateConfig) -> tuple[Candi
     attempts: list[CalibrationAttempt] = []
     passed: list[Candidate] = []
     last: Candidate | None = None
-    built: colmap.SfmSettings | None = None
+    built: SfmSettings | None = None
     for settings in _plan(config):
         if passed and len(passed[0].model.T_cam_world) == len(inputs.sources):
             break
@@ -128,9 +128,9 @@ def search(folder: Path, inputs: Inputs, config: CalibrateConfig) -> tuple[Candi
     return best, attempts
 
 
-def _plan(config: CalibrateConfig) -> list[colmap.SfmSettings]:
+def _plan(config: CalibrateConfig) -> list[SfmSettings]:
     """Return the settings of the attempts: other seeds first, then other matching, then more features."""
-    base = colmap.SfmSettings(seed=config.seed, max_features=config.max_features, max_image_size=config.max_image_size)
+    base = SfmSettings(seed=config.seed, max_features=config.max_features, max_image_size=config.max_image_size)
     more = replace(
         base,
         max_features=2 * config.max_features,
@@ -153,8 +153,8 @@ def _plan(config: CalibrateConfig) -> list[colmap.SfmSettings]:
 def _attempt(
     folder: Path,
     inputs: Inputs,
-    settings: colmap.SfmSettings,
-    built: colmap.SfmSettings | None,
+    settings: SfmSettings,
+    built: SfmSettings | None,
     number: int,
     turntable: bool | None,
 ) -> tuple[Candidate | None, CalibrationAttempt]:
@@ -166,19 +166,19 @@ def _attempt(
             if path.is_file():
                 path.rename(folder / path.name.replace(f"-{number - 1}.", f"-{number}."))
     else:
-        colmap.build_database(database, inputs.root, [source.image for source in inputs.sources], settings)
-    exif_px = colmap.exif_focals_px(database)
+        build_database(database, inputs.root, [source.image for source in inputs.sources], settings)
+    exif_px = exif_focals_px(database)
     models, camera_model = _models(database, inputs, settings.seed)
     focals: dict[str, FocalLength] = {}
     if models:
         models[0] = _with_principal_points(models[0], camera_model, inputs, settings.seed)
         models[0], focals = _with_exif(models[0], camera_model, exif_px, inputs, settings.seed)
     pairs = tuple(
-        replace(pair, image_a=names[pair.image_a], image_b=names[pair.image_b]) for pair in colmap.read_pairs(database)
+        replace(pair, image_a=names[pair.image_a], image_b=names[pair.image_b]) for pair in read_pairs(database)
     )
     candidate = None
     if models:
-        features = {names[name]: count for name, count in colmap.feature_counts(database).items()}
+        features = {names[name]: count for name, count in feature_counts(database).items()}
         named = tuple(one.model().renamed(names) for one in models)
         found = None if turntable is False else _on_turntable(named, pairs, inputs, focals)
         if found is not None:
@@ -339,7 +339,7 @@ def _all_known(inputs: Inputs) -> bool:
     return all(source.image.camera in inputs.known for source in inputs.sources)
 
 
-def _attempt_figures(settings: colmap.SfmSettings, candidate: Candidate | None) -> CalibrationAttempt:
+def _attempt_figures(settings: SfmSettings, candidate: Candidate | None) -> CalibrationAttempt:
     outcome = "no_model" if candidate is None else "passed" if candidate.check.passed else "self_check_failed"
     return CalibrationAttempt(
         seed=settings.seed,

@@ -10,7 +10,7 @@ import numpy as np
 from .bundle import POSE
 from .pose_posterior import Posterior, posterior, without_most_telling
 from .reconstruction import Array, SfmModel
-from .turntable_motion import TurntableMotion
+from .turntable.motion import TurntableMotion
 
 UNCERTAIN_CENTER = 0.0012
 """Standard deviation of an optical centre, as a fraction of the extent of all, above which a warning is given."""

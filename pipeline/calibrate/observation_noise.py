@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .metric_scale import umeyama
 from .reconstruction import Array, SfmModel
+from .world_frame.metric_scale import umeyama
 
 LEAST_NOISE_PX = 0.05
 """Lower bound of the noise of a coordinate [px]; without one, exact observations would have no scale."""

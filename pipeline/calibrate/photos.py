@@ -29,7 +29,7 @@ from ..foreground.standing_camera import (
     surroundings,
     turning,
 )
-from .colmap import SfmImage
+from .colmap.features import SfmImage
 from .given_intrinsics import known_by_size
 
 STILL_BELOW_PX = 2.0

@@ -28,13 +28,13 @@ from numpy.typing import NDArray
 
 from .bundle import POSE, PRINCIPAL, ReducedEquations, all_errors_px, linearized, told_by_points
 from .camera_models import LADDER, LENS_PARAMETERS
+from .colmap.mapping import LOSS_SCALE
 from .focal_prior import EXIF_STD
-from .mapping import LOSS_SCALE
 from .observation_noise import LEAST_NOISE_PX
 from .observation_noise import noise_px as common_noise_px
 from .reconstruction import Array, SfmModel
 from .triangulation import cross_matrices
-from .turntable_motion import TurntableMotion
+from .turntable.motion import TurntableMotion
 
 SHARED_VARIANCE = 2.0
 """Variance of the errors of poses, in units of that of independent errors: calibrated on photos of scanned objects with

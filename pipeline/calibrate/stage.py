@@ -38,18 +38,18 @@ from ...schemas import (
 from ...schemas.calibration import CalibrationAttempt, CalibrationReport, FocalFigures, ImageVerdict
 from ...schemas.printable import typed_path
 from ..runtime.work_budget import Part, within_budget
-from . import colmap
 from .attempts import MIN_PHOTOS, Candidate, check_figures, estimated, photo_count, photo_labels, search, verdict
 from .center_uncertainty import UNCERTAIN_CENTER, pose_stds
-from .depth_scale import from_depth
+from .colmap.features import versions
 from .folded_cameras import folded_sides
 from .given_intrinsics import read_intrinsics
-from .markers import detect_markers, dictionary
-from .metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
 from .photos import Inputs, gather, video_of
 from .reconstruction import Array, SfmCamera, SfmModel, Similarity, world_from_cam
-from .turntable_motion import TurntableMotion
-from .world_frame import dominant_plane, ground_frame, upright_frame
+from .turntable.motion import TurntableMotion
+from .world_frame.axes import dominant_plane, ground_frame, upright_frame
+from .world_frame.depth_scale import from_depth
+from .world_frame.markers import detect_markers, dictionary
+from .world_frame.metric_scale import MetricFrame, from_camera_distance, from_known_distance, from_markers
 
 CAMERAS_NAME = "cameras.json"
 REPORT_NAME = "calibration.json"
@@ -317,7 +317,7 @@ def _report(
             *_uncertain_rotations(turns),
         ),
         config=config,
-        versions=colmap.versions(),
+        versions=versions(),
         wall_time_s=0.0,
     )
 

@@ -20,7 +20,7 @@ from ...schemas import (
     FittedParameter,
     SplatCheck,
 )
-from ..calibrate.metric_scale import umeyama
+from ..calibrate.world_frame.metric_scale import umeyama
 from ..geometry.mesh import read_mesh, sample_surface
 from ..physics.contact_law import restitution
 

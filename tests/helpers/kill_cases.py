@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.calibrate.target import one_opencv_thread
+from cgwm.pipeline.calibrate.target.intrinsics import one_opencv_thread
 from cgwm.pipeline.phys_geo.images import pose_search, pose_tracking
 from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.runtime.checkpoint import Checkpoint

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from cgwm.pipeline.calibrate.target_board import COLUMNS, ROWS, SHEET_MM, SQUARE_MM, black_rectangles
+from cgwm.pipeline.calibrate.target.board import COLUMNS, ROWS, SHEET_MM, SQUARE_MM, black_rectangles
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 600.0
 K = np.array([[FOCAL, 0, 330.0], [0, FOCAL, 236.0], [0, 0, 1.0]])

@@ -17,10 +17,11 @@ import pytest
 from cgwm.datasets import Capture
 from cgwm.datasets.capture.cameras import read_cameras, require_metric
 from cgwm.datasets.capture.sparse_points import read_points
-from cgwm.pipeline.calibrate import attempts, calibrate, colmap, mapping, stage
+from cgwm.pipeline.calibrate import attempts, calibrate, stage
+from cgwm.pipeline.calibrate.colmap import features, mapping
 from cgwm.pipeline.calibrate.consistency_check import PairCheck, SelfCheck
-from cgwm.pipeline.calibrate.markers import dictionary
 from cgwm.pipeline.calibrate.photos import background_flow, gather
+from cgwm.pipeline.calibrate.world_frame.markers import dictionary
 from cgwm.schemas import (
     CalibrateConfig,
     CalibrationReport,
@@ -210,7 +211,7 @@ def test_an_error_in_one_of_several_threads_ends_the_others_and_is_raised():
             time.sleep(0.001)
 
     with pytest.raises(RuntimeError, match="a broken photo"):
-        colmap._run_together([waiting, broken, waiting], seed=0)
+        features._run_together([waiting, broken, waiting], seed=0)
 
 
 def test_without_scale_the_ground_is_the_dominant_plane(scene, report, tmp_path):
@@ -274,7 +275,7 @@ def test_a_model_that_contradicts_itself_is_followed_by_another_seed_on_the_same
     root = _fresh(scene, tmp_path, photos=4)
     config = CalibrateConfig(max_features=400, seed=3, retries=1)
     built, models = [], {}
-    build, find = colmap.build_database, attempts._models
+    build, find = attempts.build_database, attempts._models
 
     def build_database(database, *given):
         built.append(database)
@@ -286,7 +287,7 @@ def test_a_model_that_contradicts_itself_is_followed_by_another_seed_on_the_same
             models[seed] = find(database, inputs, seed)
         return [*models[seed][0]], models[seed][1]
 
-    monkeypatch.setattr(colmap, "build_database", build_database)
+    monkeypatch.setattr(attempts, "build_database", build_database)
     monkeypatch.setattr(attempts, "_models", find_models)
     checks = [_failed_check, attempts.check_model]
 
@@ -324,14 +325,14 @@ def test_known_intrinsics_are_used_and_two_runs_give_the_same_cameras_on_any_num
     scene, tmp_path, monkeypatch
 ):
     root, written = _fresh(scene, tmp_path, MANIFEST + MARKERS + KNOWN, photos=4), []
-    monkeypatch.setattr(colmap, "_EXTRACTION_CHUNK", 1)
-    monkeypatch.setattr(colmap, "_MATCHING_BLOCK", 2)
-    read, existing = [], colmap._existing_camera
+    monkeypatch.setattr(features, "_EXTRACTION_CHUNK", 1)
+    monkeypatch.setattr(features, "_MATCHING_BLOCK", 2)
+    read, existing = [], features._existing_camera
     monkeypatch.setattr(
-        colmap, "_existing_camera", lambda place, name: (read.append(place.name), existing(place, name))[1]
+        features, "_existing_camera", lambda place, name: (read.append(place.name), existing(place, name))[1]
     )
     for processors in (1, 3):
-        for module in (attempts, colmap):
+        for module in (attempts, features):
             monkeypatch.setattr(module, "processors", lambda count=processors: count)
         read.clear()
         calibrate(root, CalibrateConfig(max_features=400), overwrite=processors > 1)
@@ -388,10 +389,10 @@ def test_self_check_on_a_real_model_and_the_same_model_broken(scene, tmp_path):
     names = sorted(path.name for path in (scene / "images" / "walk").iterdir())[:4]
     for name in names:
         (tmp_path / name.replace(" ", "")).write_bytes((scene / "images" / "walk" / name).read_bytes())
-    images = [colmap.SfmImage(name.replace(" ", ""), "photos") for name in names]
-    colmap.build_database(tmp_path / "a.db", tmp_path, images, colmap.SfmSettings(max_features=400))
+    images = [features.SfmImage(name.replace(" ", ""), "photos") for name in names]
+    features.build_database(tmp_path / "a.db", tmp_path, images, features.SfmSettings(max_features=400))
     model = mapping.map_database(tmp_path / "a.db", tmp_path, 0, {"photos": "SIMPLE_RADIAL"}, {})[0].model()
-    pairs = colmap.read_pairs(tmp_path / "a.db")
+    pairs = features.read_pairs(tmp_path / "a.db")
     right = attempts.check_model(model, pairs)
     assert right.passed
     assert right.strong
@@ -420,7 +421,7 @@ def test_interruption_leaves_nothing(scene, tmp_path, monkeypatch):
 
 def test_every_plan_starts_with_the_users_settings():
     plan = attempts._plan(CalibrateConfig(seed=7, max_features=1000, retries=6))
-    assert plan[0] == colmap.SfmSettings(seed=7, max_features=1000)
+    assert plan[0] == features.SfmSettings(seed=7, max_features=1000)
     assert len(plan) == 7
     assert len({settings.seed for settings in plan}) == 7
     assert plan[0].matches == plan[1].matches != plan[2].matches

@@ -11,11 +11,11 @@ import pytest
 from cgwm.pipeline.calibrate import attempts, pose_posterior
 from cgwm.pipeline.calibrate.camera_models import LADDER
 from cgwm.pipeline.calibrate.center_uncertainty import center_stds, pose_stds
-from cgwm.pipeline.calibrate.mapping import Mapped, adjusted, without_outliers
-from cgwm.pipeline.calibrate.metric_scale import umeyama
+from cgwm.pipeline.calibrate.colmap.mapping import Mapped, adjusted, without_outliers
 from cgwm.pipeline.calibrate.observation_noise import moved_by_dropping, noise_by_image
 from cgwm.pipeline.calibrate.pose_posterior import posterior, principal_points
 from cgwm.pipeline.calibrate.reconstruction import SfmModel, Similarity
+from cgwm.pipeline.calibrate.world_frame.metric_scale import umeyama
 from helpers.sfm_scene import look_at, make_scene, rotation_about
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation

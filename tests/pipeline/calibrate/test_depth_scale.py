@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cgwm.pipeline.calibrate.depth_scale import SENSOR_STD, from_depth
 from cgwm.pipeline.calibrate.reconstruction import SfmModel, Similarity
+from cgwm.pipeline.calibrate.world_frame.depth_scale import SENSOR_STD, from_depth
 from helpers.sfm_scene import make_scene
 
 UNIT_M = 0.37

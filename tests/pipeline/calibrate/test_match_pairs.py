@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pycolmap
 import pytest
-from cgwm.pipeline.calibrate.match_pairs import match_apart, match_pairs
+from cgwm.pipeline.calibrate.colmap.match_pairs import match_apart, match_pairs
 
 SETTINGS = {"seed": 0, "guided_matching": False, "max_ratio": 0.8, "verification_trials": 200}
 NAMES, FEATURES = ("a.jpg", "b.jpg", "c.jpg"), 600  # as many as are compared by a BLAS: from 512 on

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 from cgwm.pipeline.calibrate import attempts
-from cgwm.pipeline.calibrate.mapping import Mapped
+from cgwm.pipeline.calibrate.colmap.mapping import Mapped
 from cgwm.pipeline.calibrate.pose_posterior import posterior
 from helpers.sfm_scene import look_at
 

@@ -7,11 +7,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from cgwm.pipeline.calibrate.markers import detect_markers, dictionary, marker_corners
-from cgwm.pipeline.calibrate.metric_scale import from_camera_distance, from_known_distance, from_markers, umeyama
 from cgwm.pipeline.calibrate.reconstruction import SfmModel, Similarity
 from cgwm.pipeline.calibrate.triangulation import triangulate
-from cgwm.pipeline.calibrate.world_frame import dominant_plane, ground_frame, upright_frame
+from cgwm.pipeline.calibrate.world_frame.axes import dominant_plane, ground_frame, upright_frame
+from cgwm.pipeline.calibrate.world_frame.markers import detect_markers, dictionary, marker_corners
+from cgwm.pipeline.calibrate.world_frame.metric_scale import (
+    from_camera_distance,
+    from_known_distance,
+    from_markers,
+    umeyama,
+)
 from cgwm.schemas import InputDataError, KnownCameraDistance, KnownDistance, Marker, NotConvergedError, Pose
 from helpers.sfm_scene import make_scene, rotation_about
 

@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pytest
 from cgwm.datasets.capture.capture import Capture
-from cgwm.pipeline.calibrate import calibrate_target, print_target, target
+from cgwm.pipeline.calibrate import calibrate_target, print_target
 from cgwm.pipeline.calibrate.given_intrinsics import read_intrinsics
 from cgwm.pipeline.calibrate.photos import gather
-from cgwm.pipeline.calibrate.target_board import charuco_board
+from cgwm.pipeline.calibrate.target import intrinsics
+from cgwm.pipeline.calibrate.target.board import charuco_board
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import InputDataError, IntrinsicsFile, OutputExistsError, UsageError, read_json
 from helpers.exif import add_exif, tiff
@@ -106,8 +107,8 @@ def test_the_stated_deviation_is_the_scatter_of_fits() -> None:
     drawn = [cv2.projectPoints(places, turn, shift, K, LENS)[0][:, 0] for turn, shift in poses(10)]
     focals, stated = [], []
     for _ in range(16):
-        noisy = [target._Seen(str(k), places, xy + rng.normal(0, 0.2, xy.shape)) for k, xy in enumerate(drawn)]
-        fit = target._fitted(noisy, (WIDTH, HEIGHT))
+        noisy = [intrinsics._Seen(str(k), places, xy + rng.normal(0, 0.2, xy.shape)) for k, xy in enumerate(drawn)]
+        fit = intrinsics._fitted(noisy, (WIDTH, HEIGHT))
         focals.append(fit.K[0, 0])
         stated.append(fit.stds[0])
     # 16 draws: the standard error of a standard deviation is 18 %

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from cgwm.datasets.synthetic.rig import look_at
 from cgwm.pipeline.calibrate import attempts
-from cgwm.pipeline.calibrate.mapping import Mapped, without_outliers
+from cgwm.pipeline.calibrate.colmap.mapping import Mapped, without_outliers
 from cgwm.pipeline.calibrate.reconstruction import SfmCamera, SfmModel
 from cgwm.pipeline.calibrate.track_alignment import aligned
 from numpy.typing import NDArray

@@ -9,11 +9,11 @@ import pytest
 from cgwm.datasets.synthetic.rig import look_at
 from cgwm.pipeline.calibrate.bundle import linearized
 from cgwm.pipeline.calibrate.center_uncertainty import center_stds
-from cgwm.pipeline.calibrate.metric_scale import umeyama
 from cgwm.pipeline.calibrate.reconstruction import SfmCamera, SfmModel, Similarity, VerifiedPair
-from cgwm.pipeline.calibrate.turntable_adjustment import adjusted
-from cgwm.pipeline.calibrate.turntable_cameras import on_turntable
-from cgwm.pipeline.calibrate.turntable_motion import TurntableMotion, turntable_motion
+from cgwm.pipeline.calibrate.turntable.adjustment import adjusted
+from cgwm.pipeline.calibrate.turntable.cameras import on_turntable
+from cgwm.pipeline.calibrate.turntable.motion import TurntableMotion, turntable_motion
+from cgwm.pipeline.calibrate.world_frame.metric_scale import umeyama
 from scipy.spatial.transform import Rotation
 
 COUNT, NOISE_PX = 8, 0.3

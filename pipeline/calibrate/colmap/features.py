@@ -24,11 +24,11 @@ from typing import Any, TypeVar
 import numpy as np
 import pycolmap
 
-from ...datasets.io.processors import processors
-from ...datasets.io.progress import progress
+from ....datasets.io.processors import processors
+from ....datasets.io.progress import progress
+from ..reconstruction import VerifiedPair
+from ..turntable.features import standing_features
 from .match_pairs import match_apart, match_pairs
-from .reconstruction import VerifiedPair
-from .turntable import standing_features
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")

@@ -10,17 +10,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ...datasets.capture.exif import photo_lens
-from ...datasets.capture.files import entries_of
-from ...datasets.capture.images import IMAGE_SUFFIXES, read_rgb, unread_kinds
-from ...datasets.io.atomic import new_file
-from ...datasets.io.outputs import reads
-from ...datasets.io.progress import progress
-from ...schemas import CameraIntrinsics, InputDataError, NotConvergedError
-from ...schemas.intrinsics import IntrinsicsFile, TargetPhoto
-from ...schemas.printable import typed_path
-from .reconstruction import Array
-from .target_board import charuco_board
+from ....datasets.capture.exif import photo_lens
+from ....datasets.capture.files import entries_of
+from ....datasets.capture.images import IMAGE_SUFFIXES, read_rgb, unread_kinds
+from ....datasets.io.atomic import new_file
+from ....datasets.io.outputs import reads
+from ....datasets.io.progress import progress
+from ....schemas import CameraIntrinsics, InputDataError, NotConvergedError
+from ....schemas.intrinsics import IntrinsicsFile, TargetPhoto
+from ....schemas.printable import typed_path
+from ..reconstruction import Array
+from .board import charuco_board
 
 INTRINSICS_NAME = "intrinsics.json"
 MIN_PHOTOS, MIN_CORNERS = 8, 12

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .reconstruction import Array, SfmCamera, SfmModel, VerifiedPair
-from .turntable_motion import TurntableMotion, about_z
-from .turntable_points import with_points
+from ..reconstruction import Array, SfmCamera, SfmModel, VerifiedPair
+from .motion import TurntableMotion, about_z
+from .points import with_points
 
 MOVED_PX = 2.0
 """Least displacement of a match that tells an angle [px]: what stands with the camera, and outlines, do not move."""

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..reconstruction import SfmModel
 from .metric_scale import MetricFrame, scaling
-from .reconstruction import SfmModel
 
 SENSOR_STD = 0.01
 """Standard error of the scale of a depth sensor, which no number of maps makes smaller: half of the 2 % that Intel

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .reconstruction import Array, SfmModel, Similarity
+from ..reconstruction import Array, SfmModel, Similarity
 
 _TRIALS = 500
 _THICKNESS = 0.005

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import InputDataError, did_you_mean
-from .reconstruction import Array
+from ....schemas import InputDataError, did_you_mean
+from ..reconstruction import Array
 
 _PREFIX = "DICT_"
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...schemas import InputDataError, KnownCameraDistance, KnownDistance, Marker, NotConvergedError
+from ....schemas import InputDataError, KnownCameraDistance, KnownDistance, Marker, NotConvergedError
+from ..reconstruction import Array, SfmModel, Similarity
+from ..triangulation import TriangulatedPoint, center_std, triangulate
 from .markers import marker_corners
-from .reconstruction import Array, SfmModel, Similarity
-from .triangulation import TriangulatedPoint, center_std, triangulate
 
 Sightings = Mapping[int, Mapping[str, Array]]
 """Corner pixels (4, 2) by marker id and image."""

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from .consistency_check import consistent_inliers
-from .reconstruction import Array, SfmModel, VerifiedPair
+from ..consistency_check import consistent_inliers
+from ..reconstruction import Array, SfmModel, VerifiedPair
 
 Ids = NDArray[np.int64]
 Mask = NDArray[np.bool_]

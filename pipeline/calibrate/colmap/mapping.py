@@ -15,11 +15,11 @@ from typing import Any, TypeVar
 import numpy as np
 import pycolmap
 
-from ...datasets.io.progress import progress
-from ...schemas import CameraIntrinsics
-from .colmap import camera_names, count, run
-from .observation_noise import moved_by_dropping, noise_by_image, noise_px
-from .reconstruction import Array, SfmCamera, SfmModel
+from ....datasets.io.progress import progress
+from ....schemas import CameraIntrinsics
+from ..observation_noise import moved_by_dropping, noise_by_image, noise_px
+from ..reconstruction import Array, SfmCamera, SfmModel
+from .features import camera_names, count, run
 
 _Given = TypeVar("_Given")
 _MIN_MODEL_IMAGES = 3

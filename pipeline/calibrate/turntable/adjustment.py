@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..optimization.least_squares import Policy, descend
-from ..optimization.problem import Box, Point, Problem, Rows
-from .bundle import NormalEquations, ReducedEquations, all_errors_px, linearized, moved_lens
-from .camera_models import LENS_PARAMETERS
-from .reconstruction import Array, SfmModel
-from .turntable_motion import TurntableMotion
+from ...optimization.least_squares import Policy, descend
+from ...optimization.problem import Box, Point, Problem, Rows
+from ..bundle import NormalEquations, ReducedEquations, all_errors_px, linearized, moved_lens
+from ..camera_models import LENS_PARAMETERS
+from ..reconstruction import Array, SfmModel
+from .motion import TurntableMotion
 
 _POLICY = Policy(
     iterations=160, damping=1e-3, up=8.0, least_damping=1e-9, most_damping=1e6, relative=1e-5, linearise_end=False

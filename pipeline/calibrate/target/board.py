@@ -12,9 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ...datasets.io.atomic import new_file
-from ...schemas import UsageError
-from ...schemas.intrinsics import TargetSheet
+from ....datasets.io.atomic import new_file
+from ....schemas import UsageError
+from ....schemas.intrinsics import TargetSheet
 
 COLUMNS, ROWS, SQUARE_MM, MARKER_MM = 10, 7, 26.0, 19.25
 SHEET_MM = (297.0, 210.0)

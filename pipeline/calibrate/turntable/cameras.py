@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .bundle import POSE, all_errors_px
-from .camera_models import LENS_PARAMETERS, focal_numbers, robust_cost, supported
-from .mapping import LOSS_SCALE
-from .observation_noise import noise_px
-from .reconstruction import Array, SfmCamera, SfmModel, VerifiedPair
-from .turntable_adjustment import adjusted
-from .turntable_motion import TurntableMotion, turntable_motion
-from .turntable_places import with_places
+from ..bundle import POSE, all_errors_px
+from ..camera_models import LENS_PARAMETERS, focal_numbers, robust_cost, supported
+from ..colmap.mapping import LOSS_SCALE
+from ..observation_noise import noise_px
+from ..reconstruction import Array, SfmCamera, SfmModel, VerifiedPair
+from .adjustment import adjusted
+from .motion import TurntableMotion, turntable_motion
+from .places import with_places
 
 _KEEP_WITHIN = (4.0, 3.0)
 """As in `mapping`: residuals above this many standard deviations are taken for wrong matches, in turn."""

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .bundle import POSE
-from .reconstruction import Array, SfmModel, Similarity
+from ..bundle import POSE
+from ..reconstruction import Array, SfmModel, Similarity
 
 LEAST_RING = 5
 """Least number of photos of a ring; other photos have poses of their own."""

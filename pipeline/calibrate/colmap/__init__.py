@@ -1,0 +1,1 @@
+"""Adapter of pycolmap: features, matches, cameras and points, repeatable bit for bit."""

@@ -1,0 +1,1 @@
+"""The calibration target: its sheet to print, and intrinsics from photos of it."""
