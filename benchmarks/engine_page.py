@@ -10,6 +10,7 @@ Rows keep the errors of every episode, the friction with its interval, seconds a
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from collections import Counter
@@ -39,6 +40,9 @@ ROWS = {
     "DreamerV3, 100 true trajectories, 4x": "DreamerV3, 4x",
 }
 """Rows of the page, in its order, and their names there."""
+LEARNED = tuple(name for name in ROWS if name.startswith(("PIN-WM", "DreamerV3")))
+DRAWN = 12
+"""Captures of the learned rivals, in all."""
 TASKS = ("fall", "push", "tip")
 ENGINES = ("rapier", "dart", "mujoco")
 WANTED = 8
@@ -52,12 +56,26 @@ _INTRODUCTION = (
     "mm / deg: medians over the ten test motions of a capture, then over captures, whose number stands in brackets. "
     "Differences to cgwm are paired by capture: median, and 95 % interval of a bootstrap over captures; for mm and deg "
     "the row is worse above 0, for dB below. *As published* is `phys-geo.contact_law=paper`, with the joint refinement "
-    "of geometry."
+    "of geometry. In the tables with all columns, the mean over captures stands in brackets behind mm / deg.\n\n"
+    "One command measures every row, in pieces: it takes up what is stored, begins nothing after its time, and can be "
+    "killed. The rows of PIN-WM and DreamerV3 are asked for by their names in the same way, once their code is there "
+    "([The rivals themselves](rivals.md)); DART, Rapier and MuJoCo are in `benchmarks/requirements.txt`.\n\n"
+    "<!-- illustrative: takes ten minutes on 16 cores and a GPU, and gets through a part -->\n"
+    "```sh\n"
+    "python benchmarks/fall_push.py --device cuda --tasks fall,push,tip --engines rapier,dart,mujoco \\\n"
+    "    --objects box,l_block,mustard_bottle,mug --captures 8 --seed 500 --psnr-every 10 --any-commit \\\n"
+    "    --workers 16 --seconds 480 --folder out/fall_push --drafts out/drafts \\\n"
+    '    --rows "{rows}"\n'
+    "python benchmarks/engine_page.py take out/evidence/fall_push.jsonl\n"
+    "```\n\n"
+    "Failures with pictures: [Where it fails](engine-floor.md#where-it-fails); what costs most, as a chart: "
+    "[Error budget](error-budget.md); object PSNR over the horizon: [Few photos](error-budget.md#few-photos)."
 )
 _POOLED = (
     "row", "captures", "mm / deg", "object PSNR dB", "friction error %", "intervals that hold", "seconds",
     "to cgwm: mm", "deg", "dB",
 )  # fmt: skip
+_OVER = ("row", "engines", "captures", "mm", "deg", "object PSNR dB", "friction error %", "to cgwm: mm", "deg", "dB")
 _BARS = ("task", "captures", "cgwm / floor, mm", "cgwm / floor, deg", "PSNR to the floor's, dB")
 
 
@@ -96,13 +114,84 @@ def read(path: Path) -> list[dict[str, Any]]:
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """Return the page in Markdown."""
     others = [row for row in rows if row["engine"] not in POOLED_WITHOUT]
-    parts = [_INTRODUCTION, "## All engines but MuJoCo"]
+    parts = [
+        _INTRODUCTION.replace("{rows}", "; ".join(name for name in ROWS if name not in LEARNED)),
+        "## All engines but MuJoCo",
+    ]
     for task in TASKS:
         parts.append(f"**{task.capitalize()}**\n\n{_pooled([row for row in others if row['task'] == task])}")
     parts.append(f"**All three tasks**\n\n{_pooled(others)}")
     parts.append(f"**Against the floor**, on the captures that have both\n\n{_bars(others)}")
-    parts += ["## By engine", _by_engine(rows), "## Captures", _counts(rows)]
+    parts.append(
+        "## Over engines\n\nThe median over captures of each engine, MuJoCo among them; then the median and the mean "
+        "over the engines that have the row. Differences are paired by capture, over all of them."
+    )
+    parts += [f"**{task.capitalize()}**\n\n{_over_engines(_of(rows, task=task))}" for task in TASKS]
+    parts += ["## By engine", _by_engine(rows)]
+    for task, engine in itertools.product(TASKS, ENGINES):
+        here = _of(rows, task=task, engine=engine)
+        if here:
+            parts.append(f"**{task.capitalize()}, {engine}**\n\n{_pooled(here)}")
+    parts += ["## Captures", _counts(rows), "## Not run", _not_run(rows)]
     return "\n\n".join(parts) + "\n"
+
+
+def _of(rows: Sequence[dict[str, Any]], **values: str) -> list[dict[str, Any]]:
+    return [row for row in rows if all(row[key] == value for key, value in values.items())]
+
+
+def _friction(rows: Sequence[dict[str, Any]], name: str) -> float | None:
+    """Return the median error of friction of a row [%]; None where it finds none, or is given the true one."""
+    known = [row for row in rows if row["row"] == name and "fit" in row and "friction" in row["parameter_errors"]]
+    if name == FLOOR or not known:
+        return None
+    return 100 * float(np.median([abs(row["parameter_errors"]["friction"]) for row in known]))
+
+
+def _over_engines(rows: Sequence[dict[str, Any]]) -> str:
+    """Return medians by engine as their median and mean over the engines, and differences paired by capture."""
+    lines, reference = _head(_OVER), captures_of(rows, REFERENCE)
+    for name, shown in ROWS.items():
+        mine = captures_of(rows, name)
+        if not mine:
+            continue
+        each = [captures_of(_of(rows, engine=engine), name) for engine in ENGINES]
+        each = [one for one in each if one]
+        cells = [shown, str(len(each)), str(len(mine))]
+        for key in (_MM, _DEG, _DB):
+            middles = [
+                float(np.median(values)) for one in each if (values := [m[key] for m in one.values() if key in m])
+            ]
+            cells.append(_median_mean(middles, _DECIMALS[key]))
+        errors = [_friction(_of(rows, engine=engine), name) for engine in ENGINES]
+        cells.append(_median_mean([one for one in errors if one is not None], 0))
+        cells += [difference(mine, reference, key) if name != REFERENCE else "" for key in (_MM, _DEG, _DB)]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _median_mean(values: Sequence[float], digits: int) -> str:
+    return f"{np.median(values):.{digits}f}, {np.mean(values):.{digits}f}" if values else "–"
+
+
+def _not_run(rows: Sequence[dict[str, Any]]) -> str:
+    """Return which captures that cgwm has a row of lack another row; of learned rivals twelve were drawn."""
+    lines = _head(("row", "captures", "not run"))
+    every = captures_of(rows, REFERENCE)
+    for name, shown in ROWS.items():
+        mine = captures_of(rows, name)
+        lacking = sorted(set(every) - set(mine))
+        if name == REFERENCE or not lacking:
+            continue
+        if name in LEARNED:
+            words = f"{DRAWN} were drawn, see [The learned rivals](engine-floor.md#the-learned-rivals-themselves)"
+        else:
+            places: dict[str, list[str]] = {}
+            for engine, task, obj, ground, _ in lacking:
+                places.setdefault(f"{task} {engine}", []).append(f"{obj} {ground}".replace("_", " "))
+            words = "; ".join(f"{place}: {', '.join(names)}" for place, names in places.items())
+        lines.append(f"| {shown} | {len(mine)} of {DRAWN if name in LEARNED else len(every)} | {words} |")
+    return "\n".join(lines)
 
 
 def _head(names: Sequence[str]) -> list[str]:
@@ -133,16 +222,15 @@ def _pooled(rows: Sequence[dict[str, Any]]) -> str:
         mine, chosen = captures_of(rows, name), [row for row in rows if row["row"] == name and "fit" in row]
         if not mine:
             continue
-        errors = [abs(row["parameter_errors"]["friction"]) for row in chosen if "friction" in row["parameter_errors"]]
         kept = [one for row in chosen for one in held(row)]
         seconds = [row["fit"]["seconds"] for row in chosen if row["fit"]["seconds"]]
-        known = bool(errors) and name != FLOOR
+        error = _friction(rows, name)
         cells = [
             shown,
             str(len(mine)),
-            _middle(mine),
+            f"{_middle(mine)} ({_mean(mine, _MM)} / {_mean(mine, _DEG)})",
             _median(mine, _DB),
-            f"{100 * np.median(errors):.0f}" if known else "–",
+            "–" if error is None else f"{error:.0f}",
         ]
         cells += [f"{sum(kept)} of {len(kept)}" if kept else "–", f"{np.median(seconds):.0f}" if seconds else "–"]
         cells += [difference(mine, reference, key) if name != REFERENCE else "" for key in (_MM, _DEG, _DB)]
@@ -203,6 +291,11 @@ def _counts(rows: Sequence[dict[str, Any]]) -> str:
 def _median(errors: Errors, key: str) -> str:
     values = [one[key] for one in errors.values() if key in one]
     return f"{np.median(values):.{_DECIMALS[key]}f}" if values else "–"
+
+
+def _mean(errors: Errors, key: str) -> str:
+    values = [one[key] for one in errors.values() if key in one]
+    return f"{np.mean(values):.{_DECIMALS[key]}f}" if values else "–"
 
 
 def _middle(errors: Errors) -> str:

@@ -61,9 +61,17 @@ def test_rows_are_reduced_and_replaced(tmp_path: Path) -> None:
 def test_the_page_pairs_captures() -> None:
     rows = [row("cgwm", k, [10.0 + k]) for k in (500, 501, 502)] + [row("floor", k, [8.0 + k]) for k in (500, 501)]
     text = engine_page.page([engine_page.reduced(one) for one in rows])
-    assert "| cgwm | 3 | 511.0 / 2.0 | 17.12 | 10 | 3 of 3 | 3 |" in text
+    assert "| cgwm | 3 | 511.0 / 2.0 (511.0 / 2.0) | 17.12 | 10 | 3 of 3 | 3 |" in text
     assert "-2.0 (-2.0 to -2.0)" in text and "| fall | 2 | 1.00 | 1.00 | +0.00 |" in text
     assert "| fall | rapier | 3 | 3 | box wood, box wood (seed 501), box wood (seed 502) |" in text
+    assert "| floor | 2 of 3 | fall rapier: box wood |" in text
+
+
+def test_engines_count_alike_whatever_their_captures() -> None:
+    rows = [row("cgwm", k, [10.0 + k]) for k in (500, 501, 502)]
+    rows += [row("cgwm", 500, [100.0]) | {"engine": engine, "key": engine} for engine in ("dart", "mujoco")]
+    text = engine_page.page([engine_page.reduced(one) for one in rows])
+    assert "| cgwm | 3 | 5 | 100.0, 237.0 | 2.0, 2.0 | 17.12, 17.12 | 10, 10 |" in text
 
 
 def test_a_draft_goes_on_where_it_stopped(tmp_path: Path) -> None:
