@@ -33,7 +33,7 @@ from cgwm.pipeline.control.hand.controller import HandController
 from cgwm.pipeline.control.hand.loop import run_hand
 from cgwm.pipeline.control.hand.plant import HandScenePlant
 from cgwm.pipeline.runtime.resources import no_garbage_search
-from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
+from cgwm.pipeline.sg_gs.collision.link_hulls import rounded_hull
 from cgwm.schemas import ContactParameters, HandTask
 from compared_solvers import ComparedSolvers, Note, solvers_of
 from known_object import SPREAD, errors_of, known_object, sensing_of

@@ -33,7 +33,7 @@ from cgwm.pipeline.phys_geo.tracks.open_loop_search import open_loop_errors
 from cgwm.pipeline.physics import Body, ContactLaw, State, World, simulate
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, GROUND_SHIFT, apply_parameters
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
-from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
+from cgwm.pipeline.sg_gs.collision.collision_spheres import shape_to_spheres
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.schemas import BoxShape, FileShape, Shape, SphereShape
 from numpy.typing import NDArray

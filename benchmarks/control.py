@@ -53,7 +53,7 @@ from cgwm.pipeline.control.solvers import Mppi, Solution
 from cgwm.pipeline.control.task_world import outline
 from cgwm.pipeline.control.wording import wilson
 from cgwm.pipeline.geometry.mesh import mesh_volume
-from cgwm.pipeline.sg_gs.collision_spheres import distil
+from cgwm.pipeline.sg_gs.collision.collision_spheres import distil
 from cgwm.schemas import (
     JOINTS,
     BodyModel,

@@ -26,9 +26,9 @@ from cgwm.datasets.capture.capture import Capture
 from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.rendering.image_metrics import psnr, ssim_map
 from cgwm.pipeline.runtime.device import resolve_device
-from cgwm.pipeline.sg_gs.photo_exposure import Exposures, least_squares_gain
+from cgwm.pipeline.sg_gs.photos.photo_exposure import Exposures, least_squares_gain
+from cgwm.pipeline.sg_gs.photos.views import View, load_views, render_view
 from cgwm.pipeline.sg_gs.stage import fit_scene
-from cgwm.pipeline.sg_gs.views import View, load_views, render_view
 from cgwm.schemas import SplatConfig
 from cgwm.schemas.config import Device
 from store import shared_data

@@ -22,7 +22,7 @@ from cgwm.datasets.synthetic.record import Set, _cameras_file, _empty, build_set
 from cgwm.datasets.synthetic.sensor import expose
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.geometry.spheres import Spheres
-from cgwm.pipeline.sg_gs.views import load_views, render_view
+from cgwm.pipeline.sg_gs.photos.views import load_views, render_view
 from cgwm.schemas import SplatConfig
 from store import Store
 

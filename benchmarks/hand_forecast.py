@@ -34,7 +34,7 @@ from cgwm.pipeline.physics.chains.joint_command import JointCommand
 from cgwm.pipeline.physics.chains.state import joints_of
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.state import State
-from cgwm.pipeline.sg_gs import link_hulls
+from cgwm.pipeline.sg_gs.collision import link_hulls
 from cgwm.schemas import HandTask
 
 mujoco: Any = importlib.import_module("mujoco")  # it has no type stubs

@@ -30,7 +30,7 @@ from cgwm.pipeline.physics.chains.state import with_joints
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.fused import simulate_fused
-from cgwm.pipeline.sg_gs.link_spheres import link_spheres
+from cgwm.pipeline.sg_gs.collision.link_spheres import link_spheres
 from numpy.typing import NDArray
 from torch import Tensor
 

@@ -19,8 +19,8 @@ from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.manifest import write_manifest
 from cgwm.datasets.synthetic import plan_scene
 from cgwm.datasets.synthetic.record import build_set, manifest, take_photos, truth
-from cgwm.pipeline.sg_gs.body_separation import separate
-from cgwm.pipeline.sg_gs.views import View, load_views
+from cgwm.pipeline.sg_gs.photos.views import View, load_views
+from cgwm.pipeline.sg_gs.separation.body_separation import separate
 from cgwm.schemas import PhotoBox, SplatConfig
 from store import Store
 

@@ -47,7 +47,7 @@ from .physics.inertia import inertia_elements, symmetric
 from .runtime.checkpoint import Checkpoint
 from .runtime.device import resolve_device
 from .runtime.resources import enough_memory
-from .sg_gs.collision_spheres import fills_hull
+from .sg_gs.collision.collision_spheres import fills_hull
 from .sg_gs.stage import SgGsResult, fit_scene
 
 Stage = Literal["all", "sg-gs", "phys-geo"]

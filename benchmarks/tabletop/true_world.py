@@ -20,7 +20,7 @@ from cgwm.pipeline.physics.observation_model import measure
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
 from cgwm.pipeline.physics.state import State
 from cgwm.pipeline.physics.world import World
-from cgwm.pipeline.sg_gs.collision_spheres import fills_hull, shape_to_spheres
+from cgwm.pipeline.sg_gs.collision.collision_spheres import fills_hull, shape_to_spheres
 from cgwm.schemas import FileShape, Shape
 from cgwm.schemas.materials import pair_of
 from numpy.typing import ArrayLike, NDArray

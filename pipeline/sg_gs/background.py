@@ -9,13 +9,13 @@ from typing import Any
 from ...datasets.capture.sparse_points import POINTS_NAME
 from ...schemas import InputDataError
 from ..geometry.spheres import Spheres
-from .camera_refinement import Motions, motion_record, moved_for_good
-from .colors import mean_colors
+from .appearance.colors import mean_colors
+from .appearance.initialization import scene_seeds, shows_bodies, to_spheres
+from .appearance.losses import behind, scene_loss
+from .appearance.mcmc import fit_adaptively
+from .appearance.optimize import Rates, Trainable, descend, detached, thinned
 from .context import Stage
-from .initialization import scene_seeds, shows_bodies, to_spheres
-from .losses import behind, scene_loss
-from .mcmc import fit_adaptively
-from .optimize import Rates, Trainable, descend, detached, thinned
+from .photos.camera_refinement import Motions, motion_record, moved_for_good
 
 _START_SHARE = 0.3
 """Number of background spheres at the start of a fit, as a share of the budget."""

@@ -20,18 +20,18 @@ from ..geometry.solid_grid import Array, MassProperties, Volume, grid_points
 from ..geometry.spheres import Spheres
 from ..geometry.surface_distance import Union
 from ..geometry.viewpoint import rotation_matrix
-from .collision_spheres import distil, shape_to_spheres
-from .colors import VISIBLE_PX, mean_colors, observed_colors, spread_colors
+from .appearance.colors import VISIBLE_PX, mean_colors, observed_colors, spread_colors
+from .appearance.gloss import fit_gloss
+from .appearance.initialization import body_seeds, to_spheres
+from .appearance.losses import body_loss, geometry_loss
+from .appearance.optimize import Rates, Trainable, descend, detached, thinned
+from .collision.collision_spheres import distil, shape_to_spheres
 from .context import Stage
-from .depth_refinement import refine
-from .facets import flatten_faces
-from .gloss import fit_gloss
-from .initialization import body_seeds, to_spheres
-from .losses import body_loss, geometry_loss
-from .optimize import Rates, Trainable, descend, detached, thinned
-from .view_overlap import require_body_in_masks
-from .views import COVERED, View, body_windows
-from .visual_hull import carve
+from .photos.view_overlap import require_body_in_masks
+from .photos.views import COVERED, View, body_windows
+from .solid.depth_refinement import refine
+from .solid.facets import flatten_faces
+from .solid.visual_hull import carve
 
 OUTWARD, OUTWARD_PHOTOS = (0.0, 0.1, 0.2, 0.3, 0.4), 12
 """How far fitted spheres are tried to be moved out, in their scales, and photos in which that is judged, evenly

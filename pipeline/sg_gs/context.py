@@ -13,10 +13,10 @@ from ...datasets.capture.sparse_points import POINTS_NAME, read_points
 from ...schemas import Ground, SplatConfig
 from ..geometry.solid_grid import Array
 from ..runtime.checkpoint import Checkpoint, Slot
-from .initialization import points_of_depth
-from .photo_exposure import Exposures
-from .view_overlap import require_points_in_view
-from .views import View, spread_of
+from .appearance.initialization import points_of_depth
+from .photos.photo_exposure import Exposures
+from .photos.view_overlap import require_points_in_view
+from .photos.views import View, spread_of
 
 _FEW_IN_VIEW = 0.5
 _DEPTH_POINTS = 20_000

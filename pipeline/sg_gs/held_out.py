@@ -14,9 +14,9 @@ from torch import Tensor
 from ..geometry.spheres import Spheres
 from ..rendering.contact_sheets import SHEET_BYTES, compared, small_png
 from ..rendering.image_metrics import psnr, ssim_map
-from .camera_refinement import find_motion, moved
-from .photo_exposure import Exposures, least_squares_gain
-from .views import COVERED, View, as_bytes, camera_center, render_view
+from .photos.camera_refinement import find_motion, moved
+from .photos.photo_exposure import Exposures, least_squares_gain
+from .photos.views import COVERED, View, as_bytes, camera_center, render_view
 
 
 @dataclass(frozen=True)

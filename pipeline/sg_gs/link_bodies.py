@@ -12,8 +12,8 @@ from ..geometry.mesh import mesh_volume
 from ..geometry.solid_grid import MassProperties
 from ..geometry.surface_distance import Union
 from .bodies import BodyResult
-from .collision_spheres import CollisionSpheres
-from .link_spheres import link_mesh, link_spheres
+from .collision.collision_spheres import CollisionSpheres
+from .collision.link_spheres import link_mesh, link_spheres
 
 _NOTHING = MassProperties(1e-9, np.zeros(3), np.eye(3))
 """Mass properties of a link without geometry, which does not move."""

@@ -17,14 +17,14 @@ from ..rendering.contact_sheets import SHEET_BYTES, separated, small_png
 from ..runtime.checkpoint import Checkpoint
 from ..runtime.device import resolve_device
 from .background import fit_background, refine_poses
-from .bare_ground import bare_ground
 from .bodies import BodyResult, fit_body
-from .body_separation import separate
 from .context import Stage
+from .ground.bare_ground import bare_ground
 from .held_out import HeldOut, look
 from .link_bodies import link_results
+from .photos.views import COVERED, as_bytes, load_views, middle_view
+from .separation.body_separation import separate
 from .turntable import turntable, upward
-from .views import COVERED, as_bytes, load_views, middle_view
 
 _MIN_PHOTOS = 3
 _UNEVEN_DB = 1.0

@@ -15,7 +15,7 @@ from ..geometry.solid_grid import Array
 from ..geometry.spheres import Spheres
 from ..geometry.viewpoint import look_at
 from ..rendering.render import render
-from .views import View, as_bytes, focus_of
+from .photos.views import View, as_bytes, focus_of
 
 FRAMES, FRAME_RATE_HZ = 60, 20.0
 _WIDTH = 320

@@ -13,7 +13,7 @@ from cgwm.pipeline.phys_geo.images import pose_search, pose_tracking
 from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
 from cgwm.pipeline.sg_gs import bodies
-from cgwm.pipeline.sg_gs.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs.solid.depth_refinement import Refinement
 from cgwm.schemas import task_toml
 from helpers.pushing import push_task
 from helpers.small_model import write_small_model

@@ -27,7 +27,7 @@ from ...physics.hull import Hull
 from ...physics.model_world import world_of_model
 from ...physics.state import State
 from ...physics.world import World
-from ...sg_gs.link_hulls import Balls, link_hulls, rounded_hull, whole_hull
+from ...sg_gs.collision.link_hulls import Balls, link_hulls, rounded_hull, whole_hull
 from ..horizon import Array
 from ..task_world import free_object, require_metric, require_rigid, softened
 from .fingertips import Fingertips

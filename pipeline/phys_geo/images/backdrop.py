@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...geometry.spheres import Spheres
 from ...rendering.render import RenderOutput, render
-from ...sg_gs.views import camera_center
+from ...sg_gs.photos.views import camera_center
 from .video_frames import Video
 
 

@@ -30,8 +30,8 @@ from ...rendering.relighting import Relighting, light_terms
 from ...rendering.render import RenderOutput, render
 from ...rendering.video_view import usable_cameras, video_view
 from ...runtime.device import resolve_device
-from ...sg_gs.colors import sphere_weights
-from ...sg_gs.views import load_views
+from ...sg_gs.appearance.colors import sphere_weights
+from ...sg_gs.photos.views import load_views
 from .edge_colors import even_edges
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import pytest
 import torch
 from cgwm.datasets.robots import read_articulation
 from cgwm.pipeline.physics.chains.articulated import Servo, chain_of
-from cgwm.pipeline.sg_gs.link_spheres import link_spheres
+from cgwm.pipeline.sg_gs.collision.link_spheres import link_spheres
 from cgwm.schemas import InputDataError, UsageError
 
 ARM = """<robot name="arm">

@@ -11,8 +11,8 @@ from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.images import write_image
 from cgwm.datasets.synthetic.rig import look_at
 from cgwm.pipeline.foreground.plain_background import foreground
-from cgwm.pipeline.sg_gs.body_separation import separate
-from cgwm.pipeline.sg_gs.views import load_views
+from cgwm.pipeline.sg_gs.photos.views import load_views
+from cgwm.pipeline.sg_gs.separation.body_separation import separate
 from cgwm.schemas import CamerasFile, InputDataError, PosedImage, Scale, SplatConfig
 
 SIZE, FOCAL, DISTANCE, RADIUS = 96, 120.0, 1.0, 0.2

@@ -9,7 +9,7 @@ from cgwm.datasets.synthetic.objects import make_object, write_obj
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.geometry.mesh import mesh_mass_properties, mesh_volume, read_mesh
 from cgwm.pipeline.geometry.primitives import spheres_volume
-from cgwm.pipeline.sg_gs.collision_spheres import (
+from cgwm.pipeline.sg_gs.collision.collision_spheres import (
     distil,
     fills_hull,
     shape_to_spheres,

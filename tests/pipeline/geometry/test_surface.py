@@ -11,7 +11,7 @@ from cgwm.datasets.shapes.meshes import Mesh
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.geometry.mesh import mesh_volume
 from cgwm.pipeline.geometry.surface_distance import Union, union_surface
-from cgwm.pipeline.sg_gs.collision_spheres import distil
+from cgwm.pipeline.sg_gs.collision.collision_spheres import distil
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
 

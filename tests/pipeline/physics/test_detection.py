@@ -10,7 +10,7 @@ from cgwm.pipeline.geometry.rotation import quat_to_matrix
 from cgwm.pipeline.physics import State, simulate
 from cgwm.pipeline.physics.contact_detection import PAIR_SMOOTHING_M, Placed, body_points, near_body
 from cgwm.pipeline.physics.smooth_distance import union_distance
-from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
+from cgwm.pipeline.sg_gs.collision.collision_spheres import shape_to_spheres
 from cgwm.schemas import BoxShape, Shape
 from helpers.worlds import F64, ball_body, batch, box_body, state_of, times, world_of
 

@@ -21,7 +21,7 @@ from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, dampi
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.hull import Hull
 from cgwm.pipeline.physics.smooth_distance import plane_contacts
-from cgwm.pipeline.sg_gs.collision_spheres import distil, shape_to_spheres
+from cgwm.pipeline.sg_gs.collision.collision_spheres import distil, shape_to_spheres
 from cgwm.schemas import BoxShape, InputDataError, Shape
 from helpers.worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 

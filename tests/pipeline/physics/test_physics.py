@@ -14,7 +14,7 @@ from cgwm.pipeline.physics import State, simulate
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.kinematic import Drive
 from cgwm.pipeline.physics.smooth_distance import plane_contacts, smooth_min, union_distance
-from cgwm.pipeline.sg_gs.collision_spheres import shape_to_spheres
+from cgwm.pipeline.sg_gs.collision.collision_spheres import shape_to_spheres
 from cgwm.schemas import BoxShape, InputDataError, Shape
 from helpers.worlds import F64, ball_body, batch, box_body, law, state_of, times, world_of
 

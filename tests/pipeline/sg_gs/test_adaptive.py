@@ -13,12 +13,12 @@ from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.geometry.spherical_harmonics import harmonics
 from cgwm.pipeline.rendering.image_metrics import psnr
 from cgwm.pipeline.rendering.label_renderer import LabelRenderer
-from cgwm.pipeline.sg_gs import mcmc
-from cgwm.pipeline.sg_gs.losses import scene_loss
-from cgwm.pipeline.sg_gs.mcmc import DEAD, Population, fit_adaptively, shared_among
-from cgwm.pipeline.sg_gs.optimize import Rates, Trainable, descend
-from cgwm.pipeline.sg_gs.photo_exposure import Exposures
-from cgwm.pipeline.sg_gs.views import View, render_view
+from cgwm.pipeline.sg_gs.appearance import mcmc
+from cgwm.pipeline.sg_gs.appearance.losses import scene_loss
+from cgwm.pipeline.sg_gs.appearance.mcmc import DEAD, Population, fit_adaptively, shared_among
+from cgwm.pipeline.sg_gs.appearance.optimize import Rates, Trainable, descend
+from cgwm.pipeline.sg_gs.photos.photo_exposure import Exposures
+from cgwm.pipeline.sg_gs.photos.views import View, render_view
 from cgwm.schemas import NotConvergedError
 from helpers.small_model import small_model
 

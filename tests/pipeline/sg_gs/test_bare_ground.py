@@ -13,9 +13,9 @@ from cgwm.datasets.capture.cameras import Camera
 from cgwm.pipeline.geometry.ground_spheres import on_plane
 from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.geometry.viewpoint import look_at
-from cgwm.pipeline.sg_gs import bare_ground as ground_module
-from cgwm.pipeline.sg_gs.cast_shadow import Caster, _cover, find_shadow
-from cgwm.pipeline.sg_gs.ground_photo import CELLS, GroundPhoto
+from cgwm.pipeline.sg_gs.ground import bare_ground as ground_module
+from cgwm.pipeline.sg_gs.ground.cast_shadow import Caster, _cover, find_shadow
+from cgwm.pipeline.sg_gs.ground.ground_photo import CELLS, GroundPhoto
 
 CELL, HALF = 0.004, np.array([0.06, 0.04, 0.05])
 BOX = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3) * HALF + [0, 0, HALF[2]]

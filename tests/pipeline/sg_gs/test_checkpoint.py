@@ -13,11 +13,12 @@ from cgwm.datasets.models.fit_inputs import photo_inputs
 from cgwm.datasets.models.model import read_model
 from cgwm.pipeline.optimization.adam import Adam
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
-from cgwm.pipeline.sg_gs import bodies, mcmc
-from cgwm.pipeline.sg_gs import optimize as descents
-from cgwm.pipeline.sg_gs.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs import bodies
+from cgwm.pipeline.sg_gs.appearance import mcmc
+from cgwm.pipeline.sg_gs.appearance import optimize as descents
+from cgwm.pipeline.sg_gs.solid.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs.solid.visual_hull import carve
 from cgwm.pipeline.sg_gs.stage import fit_scene
-from cgwm.pipeline.sg_gs.visual_hull import carve
 from cgwm.schemas import InputDataError, UsageError
 from pipeline.sg_gs.test_sg_gs import CONFIG, make_capture
 
@@ -155,7 +156,7 @@ def test_a_fit_that_is_killed_goes_on(tmp_path, capture):
     out = tmp_path / "model"
     lines = (
         "from cgwm.pipeline.runtime import checkpoint; from cgwm.pipeline.sg_gs import bodies; "
-        "from cgwm.pipeline.sg_gs.depth_refinement import Refinement; "
+        "from cgwm.pipeline.sg_gs.solid.depth_refinement import Refinement; "
         "bodies.refine = lambda hull, *_: (hull, Refinement(0.0, 0.0, 0.0)); "
         "checkpoint.Checkpoint.__init__.__defaults__ = (0.0,); from cgwm.cli import main; main()"
     )

@@ -7,10 +7,10 @@ from cgwm.datasets.capture.cameras import Camera
 from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.geometry.flat_solid import flattened
 from cgwm.pipeline.geometry.solid_grid import Volume, crossings, grid_points
-from cgwm.pipeline.sg_gs import facets
-from cgwm.pipeline.sg_gs.collision_spheres import distil
-from cgwm.pipeline.sg_gs.facets import flatten_faces
-from cgwm.pipeline.sg_gs.views import View
+from cgwm.pipeline.sg_gs.collision.collision_spheres import distil
+from cgwm.pipeline.sg_gs.photos.views import View
+from cgwm.pipeline.sg_gs.solid import facets
+from cgwm.pipeline.sg_gs.solid.facets import flatten_faces
 
 HALF, RADIUS = np.array([0.05, 0.04, 0.03]), 0.045
 WIDTH, HEIGHT, FOCAL = 120, 120, 190.0

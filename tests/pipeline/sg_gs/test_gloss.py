@@ -10,8 +10,8 @@ from cgwm.datasets.synthetic.rig import look_at
 from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.geometry.spherical_harmonics import harmonics, rotated
 from cgwm.pipeline.rendering.label_renderer import LabelRenderer
-from cgwm.pipeline.sg_gs.gloss import LEAST_VIEWS, fit_gloss
-from cgwm.pipeline.sg_gs.views import View, camera_center, render_view
+from cgwm.pipeline.sg_gs.appearance.gloss import LEAST_VIEWS, fit_gloss
+from cgwm.pipeline.sg_gs.photos.views import View, camera_center, render_view
 from helpers.small_model import cube_splats, small_model
 from scipy.spatial.transform import Rotation
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from cgwm.pipeline.geometry.directions import fibonacci_directions
-from cgwm.pipeline.sg_gs.visual_hull import Silhouette, _farthest, carve
+from cgwm.pipeline.sg_gs.solid.visual_hull import Silhouette, _farthest, carve
 from cgwm.schemas import Ground, InputDataError
 
 HALF = np.array([0.05, 0.035, 0.03])

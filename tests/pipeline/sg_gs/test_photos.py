@@ -10,15 +10,15 @@ from cgwm.datasets.capture.cameras import Camera
 from cgwm.datasets.capture.capture import Capture
 from cgwm.datasets.capture.check import find_faults
 from cgwm.pipeline.geometry.spheres import Spheres
-from cgwm.pipeline.sg_gs.camera_refinement import Motions, motion_record, moved_for_good
-from cgwm.pipeline.sg_gs.colors import mean_colors
+from cgwm.pipeline.sg_gs.appearance.colors import mean_colors
+from cgwm.pipeline.sg_gs.appearance.initialization import _neighbour_scales, points_of_depth
+from cgwm.pipeline.sg_gs.appearance.losses import geometry_loss, normals_of, scene_loss
+from cgwm.pipeline.sg_gs.appearance.optimize import Rates, Trainable, descend
 from cgwm.pipeline.sg_gs.held_out import look
-from cgwm.pipeline.sg_gs.initialization import _neighbour_scales, points_of_depth
-from cgwm.pipeline.sg_gs.losses import geometry_loss, normals_of, scene_loss
-from cgwm.pipeline.sg_gs.optimize import Rates, Trainable, descend
-from cgwm.pipeline.sg_gs.photo_exposure import Exposures
-from cgwm.pipeline.sg_gs.views import View, _seen, focus_of, load_views, middle_view, render_view, spread_of
-from cgwm.pipeline.sg_gs.visual_hull import Silhouette, carve
+from cgwm.pipeline.sg_gs.photos.camera_refinement import Motions, motion_record, moved_for_good
+from cgwm.pipeline.sg_gs.photos.photo_exposure import Exposures
+from cgwm.pipeline.sg_gs.photos.views import View, _seen, focus_of, load_views, middle_view, render_view, spread_of
+from cgwm.pipeline.sg_gs.solid.visual_hull import Silhouette, carve
 from pipeline.sg_gs.test_sg_gs import PLACE, make_capture, world
 
 SIZE_M = 0.1

@@ -19,10 +19,10 @@ from cgwm.datasets.synthetic.plan import ScenePlan
 from cgwm.datasets.synthetic.record import build_set, take_photos, truth
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.geometry.spheres import Spheres
-from cgwm.pipeline.sg_gs.body_separation import separate
-from cgwm.pipeline.sg_gs.depth_refinement import Refinement
-from cgwm.pipeline.sg_gs.object_search import ObjectSearch
-from cgwm.pipeline.sg_gs.views import load_views, with_labels
+from cgwm.pipeline.sg_gs.photos.views import load_views, with_labels
+from cgwm.pipeline.sg_gs.separation.body_separation import separate
+from cgwm.pipeline.sg_gs.separation.object_search import ObjectSearch
+from cgwm.pipeline.sg_gs.solid.depth_refinement import Refinement
 from cgwm.schemas import Body, CaptureManifest, Ground, InputDataError, PhotoBox, Shape, SplatConfig, World
 from cgwm.schemas.capture import SphereShape
 from pipeline.sg_gs.test_sg_gs import PLACE, make_capture

@@ -14,11 +14,12 @@ from cgwm.pipeline.geometry.directions import fibonacci_directions
 from cgwm.pipeline.geometry.primitives import shape_volume
 from cgwm.pipeline.geometry.spheres import Spheres
 from cgwm.pipeline.rendering.render import render
-from cgwm.pipeline.sg_gs import bodies, mcmc
-from cgwm.pipeline.sg_gs.depth_refinement import Refinement, refine
-from cgwm.pipeline.sg_gs.initialization import body_seeds
+from cgwm.pipeline.sg_gs import bodies
+from cgwm.pipeline.sg_gs.appearance import mcmc
+from cgwm.pipeline.sg_gs.appearance.initialization import body_seeds
+from cgwm.pipeline.sg_gs.photos.views import body_windows
+from cgwm.pipeline.sg_gs.solid.depth_refinement import Refinement, refine
 from cgwm.pipeline.sg_gs.stage import _open, fit_scene
-from cgwm.pipeline.sg_gs.views import body_windows
 from cgwm.schemas import InputDataError, Shape, SphereShape, SplatConfig
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 110.0

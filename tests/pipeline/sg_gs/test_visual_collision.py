@@ -9,9 +9,9 @@ from cgwm.datasets.models.model import read_model, write_model
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.physics.model_world import world_of_model
 from cgwm.pipeline.sg_gs import bodies
-from cgwm.pipeline.sg_gs.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs.solid.depth_refinement import Refinement
+from cgwm.pipeline.sg_gs.solid.visual_hull import carve
 from cgwm.pipeline.sg_gs.stage import fit_scene
-from cgwm.pipeline.sg_gs.visual_hull import carve
 from cgwm.pipeline.synthesize import synthesize
 from cgwm.schemas import ContactParameters, SynthesizeConfig, UsageError
 from pipeline.sg_gs.test_sg_gs import CONFIG, PLACE, RADIUS, make_capture, write_manifest

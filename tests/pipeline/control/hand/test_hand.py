@@ -19,7 +19,7 @@ from cgwm.pipeline.control.hand.plant import HandModelPlant, HandScenePlant
 from cgwm.pipeline.control.hand.world import hand_world
 from cgwm.pipeline.control.planning import ControlState
 from cgwm.pipeline.geometry.rotation import quat_turn
-from cgwm.pipeline.sg_gs.link_hulls import rounded_hull
+from cgwm.pipeline.sg_gs.collision.link_hulls import rounded_hull
 from cgwm.pipeline.validate import validate
 from cgwm.schemas import (
     HAND_TASKS,

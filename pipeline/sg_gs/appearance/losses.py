@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..geometry.spheres import Spheres
-from ..rendering.image_metrics import photometric
-from .photo_exposure import Exposures
-from .views import SURELY_COVERED, View, render_view
+from ...geometry.spheres import Spheres
+from ...rendering.image_metrics import photometric
+from ..photos.photo_exposure import Exposures
+from ..photos.views import SURELY_COVERED, View, render_view
 
 if TYPE_CHECKING:
-    from .camera_refinement import Motions
+    from ..photos.camera_refinement import Motions
 
 Loss = Callable[[Spheres, View, torch.Generator], tuple[Tensor, Tensor]]
 """Function that returns the loss of one view [1] and the mean square error of the compared picture or silhouette,

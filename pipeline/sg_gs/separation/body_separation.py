@@ -13,12 +13,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ...datasets.capture.capture import Capture
-from ...schemas import Body, Ground, InputDataError, PhotoBox, SplatConfig
-from ..geometry.solid_grid import Array
+from ....datasets.capture.capture import Capture
+from ....schemas import Body, Ground, InputDataError, PhotoBox, SplatConfig
+from ...geometry.solid_grid import Array
+from ..photos.views import COVERED, View
 from .mask_segmentation import Blob, Outlined, outline, outline_before_plain
 from .object_search import LEAST_SHARE, ObjectSearch, Region
-from .views import COVERED, View
 
 _POOR = 0.9
 """Agreement of the masks below which a warning asks the user to check the picture."""

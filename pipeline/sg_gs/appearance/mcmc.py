@@ -14,18 +14,18 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from ...datasets.io.progress import progress
-from ...datasets.shapes.ply import SH_C0
-from ..geometry.spheres import Spheres
-from ..geometry.spherical_harmonics import term_count
-from ..optimization.adam import Adam
-from ..rendering.image_metrics import psnr_of
-from ..runtime.checkpoint import Slot, State
-from .camera_refinement import Motions
+from ....datasets.io.progress import progress
+from ....datasets.shapes.ply import SH_C0
+from ...geometry.spheres import Spheres
+from ...geometry.spherical_harmonics import term_count
+from ...optimization.adam import Adam
+from ...rendering.image_metrics import psnr_of
+from ...runtime.checkpoint import Slot, State
+from ..photos.camera_refinement import Motions
+from ..photos.photo_exposure import Exposures
+from ..photos.views import View
 from .losses import Loss
 from .optimize import require_finite
-from .photo_exposure import Exposures
-from .views import View
 
 DEAD = 0.005
 """Opacity below which a sphere is dead and moves to a living one."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ..geometry.solid_grid import Array, Volume
+from ...geometry.solid_grid import Array, Volume
 
 LEAST_SHARE = 0.04
 """Smallest region, in units of the whole surface: on a small one a plane and a curved surface look alike."""

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, KDTree, QhullError
 from scipy.spatial.distance import cdist
 
-from ...datasets.shapes.meshes import Mesh
-from ...datasets.shapes.ply import Splats, read_splats
-from ...schemas import InputDataError, Shape
-from ..geometry.directions import fibonacci_directions
-from ..geometry.mesh import distance_to_mesh, mesh_volume, read_mesh
-from ..geometry.primitives import spheres_volume
-from ..geometry.solid_grid import Array, Volume, grid_points
-from ..geometry.surface_distance import union_distance
+from ....datasets.shapes.meshes import Mesh
+from ....datasets.shapes.ply import Splats, read_splats
+from ....schemas import InputDataError, Shape
+from ...geometry.directions import fibonacci_directions
+from ...geometry.mesh import distance_to_mesh, mesh_volume, read_mesh
+from ...geometry.primitives import spheres_volume
+from ...geometry.solid_grid import Array, Volume, grid_points
+from ...geometry.surface_distance import union_distance
 
 DIRECTIONS = 1500
 """Number of directions in which the support function is matched."""

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from ...datasets.io.progress import note
-from ...schemas import GroundShadow
-from ..geometry.ground_spheres import NODE_WEIGHTS, NODES, THIN, dimmed, on_plane
-from ..geometry.solid_grid import Array
-from ..geometry.spheres import Spheres
+from ....datasets.io.progress import note
+from ....schemas import GroundShadow
+from ...geometry.ground_spheres import NODE_WEIGHTS, NODES, THIN, dimmed, on_plane
+from ...geometry.solid_grid import Array
+from ...geometry.spheres import Spheres
+from ..appearance.initialization import to_spheres
+from ..context import Stage
+from ..photos.views import View
 from .cast_shadow import Caster, CastShadow, find_shadow
-from .context import Stage
 from .ground_photo import CELLS, GroundPhoto, near_mask, photograph_ground
-from .initialization import to_spheres
-from .views import View
 
 _LARGEST = 0.15
 """Largest scale of a sphere of the ground, of the side of the grid; larger ones are backdrop."""

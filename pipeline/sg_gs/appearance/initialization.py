@@ -11,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...schemas import Ground
-from ..geometry.directions import fibonacci_directions, upright_axes
-from ..geometry.solid_grid import Array, Volume, grid_points
-from ..geometry.spheres import Spheres
-from .collision_spheres import inscribed_radii
+from ....schemas import Ground
+from ...geometry.directions import fibonacci_directions, upright_axes
+from ...geometry.solid_grid import Array, Volume, grid_points
+from ...geometry.spheres import Spheres
+from ..collision.collision_spheres import inscribed_radii
+from ..photos.views import COVERED, View, focus_of
 from .losses import scene_weight
-from .views import COVERED, View, focus_of
 
 _SURFACE_SHARE = 0.9
 _COVER_FACTOR = 1.05  # collision radius in units of the spacing: neighbours overlap without a gap

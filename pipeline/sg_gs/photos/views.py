@@ -11,15 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.capture.cameras import Camera
-from ...datasets.capture.capture import Capture
-from ...datasets.capture.geometry_maps import GeometryMaps
-from ...datasets.io.progress import progress
-from ...schemas import InputDataError, Viewpoint
-from ..geometry.solid_grid import Array
-from ..geometry.spheres import Spheres
-from ..rendering.render import RenderOutput, render
-from .visual_hull import Silhouette
+from ....datasets.capture.cameras import Camera
+from ....datasets.capture.capture import Capture
+from ....datasets.capture.geometry_maps import GeometryMaps
+from ....datasets.io.progress import progress
+from ....schemas import InputDataError, Viewpoint
+from ...geometry.solid_grid import Array
+from ...geometry.spheres import Spheres
+from ...rendering.render import RenderOutput, render
+from .silhouette import Silhouette
 
 COVERED, SURELY_COVERED = 0.5, 0.95
 """Cover by a mask from which on a pixel counts as the body's, and as its inside, where no edge blends colours."""

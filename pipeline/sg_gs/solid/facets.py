@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.flat_solid import flattened
-from ..geometry.solid_grid import Array, Volume
+from ...geometry.flat_solid import flattened
+from ...geometry.solid_grid import Array, Volume
+from ..photos.views import View
 from .depth_refinement import agreement, smooth_normals, tangents
 from .planar_regions import Regions, planar_regions
-from .views import View
 
 _POINTS = 300
 """Patches of a region that are compared."""

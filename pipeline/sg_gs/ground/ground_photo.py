@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import Ground
-from ..geometry.directions import upright_axes
-from ..geometry.solid_grid import Array
-from .views import View
+from ....schemas import Ground
+from ...geometry.directions import upright_axes
+from ...geometry.solid_grid import Array
+from ..photos.views import View
 
 CELLS = 192
 """Cells along a side."""

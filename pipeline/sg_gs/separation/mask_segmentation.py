@@ -17,16 +17,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...datasets.capture.cameras import Camera
-from ...datasets.capture.capture import Capture
-from ...schemas import Ground
-from ..foreground.graph_cut import Band, Mask, cut, dilated, eroded
-from ..foreground.plain_background import cut_out
-from ..geometry.solid_grid import Array, crossings, grid_points
-from ..geometry.spheres import Spheres
-from ..rendering.render import render
-from .views import View, with_labels
-from .visual_hull import carve, largest_component, signed_distance_px
+from ....datasets.capture.cameras import Camera
+from ....datasets.capture.capture import Capture
+from ....schemas import Ground
+from ...foreground.graph_cut import Band, Mask, cut, dilated, eroded
+from ...foreground.plain_background import cut_out
+from ...geometry.solid_grid import Array, crossings, grid_points
+from ...geometry.spheres import Spheres
+from ...rendering.render import render
+from ..photos.views import View, with_labels
+from ..solid.visual_hull import carve, largest_component, signed_distance_px
 
 _SIZE = 800
 """Maximum longer side of the reduced photos [px]; masks are resized to the original size afterwards."""

@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ..geometry.directions import fibonacci_directions
-from ..geometry.spheres import Spheres
-from ..geometry.spherical_harmonics import harmonics, term_count
+from ...geometry.directions import fibonacci_directions
+from ...geometry.spheres import Spheres
+from ...geometry.spherical_harmonics import harmonics, term_count
+from ..photos.views import SURELY_COVERED, View, camera_center, render_view
 from .colors import VISIBLE_PX
 from .losses import cover_of
-from .views import SURELY_COVERED, View, camera_center, render_view
 
 LEAST_GAIN_DB = 0.1
 """Least gain of PSNR inside the masks of photos that took no part, for which colours depend on the direction."""

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..geometry.spheres import Spheres
+from ...geometry.spheres import Spheres
+from ..photos.views import SURELY_COVERED, View, render_view
 from .losses import cover_of
-from .views import SURELY_COVERED, View, render_view
 
 VISIBLE_PX = 0.5
 """Least weight of a visible sphere in all photos together [px]."""

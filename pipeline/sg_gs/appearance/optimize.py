@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...datasets.io.progress import progress
-from ...schemas import NotConvergedError
-from ..geometry.spheres import Spheres
-from ..optimization.adam import Adam
-from ..rendering.image_metrics import psnr_of
-from ..runtime.checkpoint import Slot, State
-from .camera_refinement import Motions
+from ....datasets.io.progress import progress
+from ....schemas import NotConvergedError
+from ...geometry.spheres import Spheres
+from ...optimization.adam import Adam
+from ...rendering.image_metrics import psnr_of
+from ...runtime.checkpoint import Slot, State
+from ..photos.camera_refinement import Motions
+from ..photos.photo_exposure import Exposures
+from ..photos.views import View
 from .losses import Loss
-from .photo_exposure import Exposures
-from .views import View
 
 _CHECK_INTERVAL = 20
 """Number of iterations between two checks that the loss is finite."""

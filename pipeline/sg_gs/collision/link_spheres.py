@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from ...datasets.robots import Articulation, GeometryOfLink, LinkOfRobot
-from ...datasets.shapes.meshes import Mesh
-from ...schemas import InputDataError, Shape
-from ..geometry.directions import fibonacci_directions
-from ..geometry.mesh import mesh_volume, require_closed
+from ....datasets.robots import Articulation, GeometryOfLink, LinkOfRobot
+from ....datasets.shapes.meshes import Mesh
+from ....schemas import InputDataError, Shape
+from ...geometry.directions import fibonacci_directions
+from ...geometry.mesh import mesh_volume, require_closed
 from .collision_spheres import distil, shape_to_spheres
 
 Array = NDArray[np.float64]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...schemas import InputDataError
-from ..geometry.solid_grid import Array
+from ....schemas import InputDataError
+from ...geometry.solid_grid import Array
 from .views import View
 
 LEAST_SHARE = 0.05

@@ -18,8 +18,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
 
-from ..geometry.solid_grid import Array, Volume, crossings, grid_points
-from .views import View
+from ...geometry.solid_grid import Array, Volume, crossings, grid_points
+from ..photos.views import View
 from .visual_hull import signed_distance_px
 
 _POINTS = 3000

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from ..geometry.solid_grid import Array
+from ...geometry.solid_grid import Array
 from .ground_photo import CELLS, GroundPhoto
 
 _AZIMUTHS, _ELEVATIONS_DEG = 36, np.arange(20.0, 86.0, 5.0)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..runtime.checkpoint import State
+from ...runtime.checkpoint import State
 from .views import View
 
 _FOLLOWING = 0.3

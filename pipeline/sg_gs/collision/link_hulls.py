@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from ...datasets.robots import Articulation, LinkOfRobot
-from ..geometry.directions import fibonacci_directions
+from ....datasets.robots import Articulation, LinkOfRobot
+from ...geometry.directions import fibonacci_directions
 from .link_spheres import mesh_of_part
 
 Array = NDArray[np.float64]

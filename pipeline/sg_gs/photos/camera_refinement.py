@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.spheres import Spheres
-from ..optimization.adam import Adam
-from ..rendering.image_metrics import photometric
-from ..runtime.checkpoint import State
+from ...geometry.spheres import Spheres
+from ...optimization.adam import Adam
+from ...rendering.image_metrics import photometric
+from ...runtime.checkpoint import State
 from .photo_exposure import least_squares_gain
 from .views import View, render_view
 

@@ -17,17 +17,17 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
 
-from ...datasets.capture.capture import Capture
-from ...schemas import Body, Ground, InputDataError, SplatConfig
-from ..geometry.directions import upright_axes
-from ..geometry.solid_grid import Array
-from ..geometry.spheres import Spheres
-from .colors import mean_colors
-from .initialization import scene_seeds, to_spheres
-from .losses import scene_loss
-from .optimize import Rates, Trainable, descend
-from .photo_exposure import Exposures
-from .views import View, focus_of, render_view
+from ....datasets.capture.capture import Capture
+from ....schemas import Body, Ground, InputDataError, SplatConfig
+from ...geometry.directions import upright_axes
+from ...geometry.solid_grid import Array
+from ...geometry.spheres import Spheres
+from ..appearance.colors import mean_colors
+from ..appearance.initialization import scene_seeds, to_spheres
+from ..appearance.losses import scene_loss
+from ..appearance.optimize import Rates, Trainable, descend
+from ..photos.photo_exposure import Exposures
+from ..photos.views import View, focus_of, render_view
 
 _SIZE = 160
 """Maximum length of the longer side of the photos that the spheres are fitted to [px]."""

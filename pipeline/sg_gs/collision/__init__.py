@@ -1,0 +1,1 @@
+"""Spheres that collide: distilled from solids, and from the links of jointed bodies."""

@@ -1,0 +1,1 @@
+"""Photos as the fit reads them: views, their overlap, exposure and corrected camera poses."""

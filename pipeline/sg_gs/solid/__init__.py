@@ -1,0 +1,1 @@
+"""The solid of a body from its silhouettes: visual hull, refinement by photo-consistency, flat faces."""
