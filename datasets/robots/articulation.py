@@ -22,12 +22,14 @@ LARGEST_M = 20.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GeometryOfLink:
-    """A solid that is fixed to a link: a box, a ball, a cylinder, a capsule or a mesh."""
+    """A solid that is fixed to a link: a box, a ball, an ellipsoid, a cylinder, a capsule or a mesh."""
 
     kind: str
-    """"box", "sphere", "cylinder", "capsule" or "mesh"."""
+    """"box", "sphere", "ellipsoid", "cylinder", "capsule" or "mesh"."""
     size_m: tuple[float, ...]
-    """Half extents of a box; radius of a ball; radius and half length along z of a cylinder or capsule; else ()."""
+    """Half extents of a box or ellipsoid; radius of a ball; radius and half length along z of a cylinder or capsule; ()
+    of a mesh.
+    """
     rotation: Array
     """Orientation in the link's frame, shape (3, 3)."""
     position_m: Array
@@ -101,6 +103,10 @@ class JointOfRobot:
     """Dry friction [N m or N]."""
     torque_limit: float = math.inf
     """Largest torque or force of the servo [N m or N]."""
+    lowest_target: float = -math.inf
+    """Smallest target that the servo takes [rad or m]."""
+    highest_target: float = math.inf
+    """Largest target that it takes [rad or m]."""
 
     def require_possible(self, path: Path) -> None:
         """Check that the joint of a file has an axis, and limits in their order.
@@ -132,6 +138,8 @@ class Articulation:
     """The links in the order of the joints, the root first."""
     joints: tuple[JointOfRobot, ...]
     """The joint of each link but the root."""
+    outside: tuple[str, ...] = ()
+    """Names of what collides in the file and belongs to no link, as a floor."""
 
     @staticmethod
     def tree(name: str, path: Path, links: dict[str, LinkOfRobot], joints: list[JointOfRobot]) -> Articulation:
@@ -204,7 +212,7 @@ class Articulation:
             home[joint.link] = (joint.link, np.eye(3), np.zeros(3))
             quat = quat_product(quat_of_matrix(turn), joint.quat_wxyz)
             joints.append(replace(joint, parent=carrier, position_m=moved, quat_wxyz=quat))
-        return Articulation.tree(self.name, self.path, links, joints)
+        return replace(Articulation.tree(self.name, self.path, links, joints), outside=self.outside)
 
 
 def _merged(carrier: LinkOfRobot, link: LinkOfRobot, turn: Array, shift: Array) -> LinkOfRobot:

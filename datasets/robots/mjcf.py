@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,8 @@ from ..shapes.turns import matrix_of
 from .articulation import Articulation, GeometryOfLink, JointOfRobot, LinkOfRobot
 
 Array = NDArray[np.float64]
-_GEOMS = {2: "sphere", 3: "capsule", 5: "cylinder", 6: "box", 7: "mesh"}
+_GEOMS = {2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}
+_OTHER_GEOMS = {0: "plane", 1: "height field", 8: "signed distance field"}
 
 
 def read_mjcf(path: Path) -> Articulation:
@@ -47,7 +50,15 @@ def read_mjcf(path: Path) -> Articulation:
     ends: dict[int, tuple[str, Array]] = {}
     for body in range(1, model.nbody):
         _append(path, model, body, links, joints, ends)
-    return Articulation.tree(path.stem, path, links, joints)
+    outside = tuple(model.geom(geom).name or f"geom {geom}" for geom in _solid(model, 0))
+    return replace(Articulation.tree(path.stem, path, links, joints), outside=outside)
+
+
+def _solid(model: Any, body: int) -> list[int]:
+    """Return the geoms of a body that collide."""
+    first = model.body_geomadr[body]
+    geoms = range(first, first + model.body_geomnum[body])
+    return [geom for geom in geoms if model.geom_contype[geom] or model.geom_conaffinity[geom]]
 
 
 def _model_of(path: Path) -> Any:
@@ -55,7 +66,7 @@ def _model_of(path: Path) -> Any:
     mujoco: Any = importlib.import_module("mujoco")
 
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        return mujoco.MjModel.from_xml_path(str(path.absolute()))
     except ValueError as error:
         raise InputDataError(
             f"{path}: MuJoCo cannot read it: {' '.join(str(error).split()).rstrip('.')}.",
@@ -78,12 +89,25 @@ def _require_plain_joints(path: Path, model: Any) -> None:
         *(f"joint '{model.joint(k).name}' has a spring" for k in springs),
         *(f"tendon '{model.tendon(k).name}' has a spring, damping, friction or limits" for k in tendons),
         *(f"actuator '{model.actuator(k).name}' does not act on a joint" for k in others),
+        *_odd_servos(model),
     ):
         raise InputDataError(
             f"{path}: {found}.",
-            "joints with servos (<position joint=...>), damping, armature, frictionloss and limits.",
+            "joints with one servo each (<position joint=...>), damping, armature, frictionloss and limits.",
             "leave it out, or give the joint a servo in its place.",
         )
+
+
+def _odd_servos(model: Any) -> Iterator[str]:
+    """Yield what no servo of a chain can do: follow its target late, or pull in one direction alone."""
+    lags = np.flatnonzero(model.actuator_dyntype != 0)
+    yield from (f"actuator '{model.actuator(k).name}' has dynamics of its own (intvelocity, timeconst)" for k in lags)
+    for joint in range(model.njnt):
+        servos = servos_of(model, joint)
+        if len(servos) > 1:
+            yield f"joint '{model.joint(joint).name}' has {len(servos)} servos"
+        if servos and not largest_force(model, joint, servos[0]) > 0:
+            yield f"actuator '{model.actuator(servos[0]).name}' pulls in one direction alone, by its range of forces"
 
 
 def _sizes(numbers: Array) -> Array:
@@ -101,7 +125,7 @@ def _append(
     parent, place = _carrier(model, body, bool(moving), links, ends)
     position, quat = model.body_pos[body] - place, model.body_quat[body]
     if not moving:
-        links[name] = _link(model, body, name, np.zeros(3))
+        links[name] = _link(path, model, body, name, np.zeros(3))
         if parent:
             joints.append(
                 JointOfRobot(
@@ -115,7 +139,7 @@ def _append(
         own = name if last else f"{name}/{model.joint(number).name or number}"
         shift = model.jnt_pos[number] - anchor
         joints.append(_joint(model, number, parent, own, position + matrix_of(quat) @ shift, quat))
-        links[own] = _link(model, body, own, model.jnt_pos[number] if last else None)
+        links[own] = _link(path, model, body, own, model.jnt_pos[number] if last else None)
         parent, position, quat, anchor = own, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), model.jnt_pos[number].copy()
     ends[body] = (name, anchor)
 
@@ -166,7 +190,7 @@ def _carrier(
 def _joint(model: Any, number: int, parent: str, link: str, position: Array, quat: Array) -> JointOfRobot:
     dof = model.jnt_dofadr[number]
     limited = bool(model.jnt_limited[number])
-    stiffness, extra, limit = _servo(model, number)
+    servo = _servo(model, number)
     return JointOfRobot(
         name=model.joint(number).name or f"joint{number}",
         kind="hinge" if model.jnt_type[number] == 3 else "slide",
@@ -177,35 +201,77 @@ def _joint(model: Any, number: int, parent: str, link: str, position: Array, qua
         axis=model.jnt_axis[number].copy(),
         lower=float(model.jnt_range[number, 0]) if limited else -math.inf,
         upper=float(model.jnt_range[number, 1]) if limited else math.inf,
-        stiffness=stiffness,
-        damping=float(model.dof_damping[dof]) + extra,
         armature=float(model.dof_armature[dof]),
         friction=float(model.dof_frictionloss[dof]),
-        torque_limit=limit,
+        **(servo | {"damping": float(model.dof_damping[dof]) + servo["damping"]}),
     )
 
 
-def _servo(model: Any, joint: int) -> tuple[float, float, float]:
-    """Return stiffness, damping and largest torque of the first actuator of a joint; 0, 0 and infinity without one."""
-    for k in range(model.nu):
-        if model.actuator_trntype[k] == 0 and model.actuator_trnid[k, 0] == joint:
-            stiffness, damping = (max(0.0, -float(value)) for value in model.actuator_biasprm[k, 1:3])
-            limited = bool(model.actuator_forcelimited[k])
-            return stiffness, damping, float(model.actuator_forcerange[k, 1]) if limited else math.inf
-    return 0.0, 0.0, math.inf
+def servos_of(model: Any, joint: int) -> list[int]:
+    """Return the actuators of a joint that pull it towards a target: a motor would take a target for a torque."""
+    return [
+        k
+        for k in range(model.nu)
+        if model.actuator_trntype[k] == 0
+        and model.actuator_trnid[k, 0] == joint
+        and (model.actuator_gaintype[k], model.actuator_biastype[k]) == (0, 1)
+        and model.actuator_gainprm[k, 0] > 0 > model.actuator_biasprm[k, 1]
+    ]
 
 
-def _link(model: Any, body: int, name: str, origin: Array | None) -> LinkOfRobot:
+def control_of(model: Any, servo: int) -> tuple[float, float]:
+    """Return factor and offset of the control of a servo by the target of its joint, where it comes to rest.
+
+    They are 1 and 0 for a <position> without gear; gears and the numbers of a <general> change them.
+    """
+    gain, (bias, pull) = float(model.actuator_gainprm[servo, 0]), model.actuator_biasprm[servo, :2].tolist()
+    return -pull * float(model.actuator_gear[servo, 0]) / gain, -bias / gain
+
+
+def largest_force(model: Any, joint: int, servo: int) -> float:
+    """Return the largest torque or force of a servo on its joint to either side [N m or N]."""
+    most = math.inf
+    if model.actuator_forcelimited[servo]:
+        low, high = model.actuator_forcerange[servo].tolist()
+        most = abs(float(model.actuator_gear[servo, 0])) * min(-low, high)
+    if model.jnt_actfrclimited[joint]:
+        low, high = model.jnt_actfrcrange[joint].tolist()
+        most = min(most, -low, high)
+    return most
+
+
+def _servo(model: Any, joint: int) -> dict[str, float]:
+    """Return what an actuator gives a joint: gain, damping, largest torque, and the range of targets."""
+    servos = servos_of(model, joint)
+    ours = [k for k in range(model.nu) if model.actuator_trntype[k] == 0 and model.actuator_trnid[k, 0] == joint]
+    gear = model.actuator_gear[:, 0]
+    found = {"damping": sum(float(gear[k] ** 2 * max(0.0, -model.actuator_biasprm[k, 2])) for k in ours)}
+    if not servos:
+        return found
+    servo = servos[0]
+    found["stiffness"] = float(-model.actuator_biasprm[servo, 1] * gear[servo] ** 2)
+    found["torque_limit"] = largest_force(model, joint, servo)
+    if model.actuator_ctrllimited[servo]:
+        factor, offset = control_of(model, servo)
+        ends = sorted((float(end) - offset) / factor for end in model.actuator_ctrlrange[servo])
+        found |= {"lowest_target": ends[0], "highest_target": ends[1]}
+    return found
+
+
+def _link(path: Path, model: Any, body: int, name: str, origin: Array | None) -> LinkOfRobot:
     """Return a link with its frame at `origin` of a body; for None one without mass."""
     if origin is None:
         return LinkOfRobot(name=name, mass_kg=0.0, com_m=np.zeros(3), inertia_kg_m2=np.zeros((3, 3)), geometry=())
     turn = matrix_of(model.body_iquat[body])
-    geoms = range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
-    parts = [
-        _geometry(model, geom, origin)
-        for geom in geoms
-        if (model.geom_contype[geom] or model.geom_conaffinity[geom]) and int(model.geom_type[geom]) in _GEOMS
-    ]
+    solid = _solid(model, body)
+    other = next((kind for geom in solid if (kind := int(model.geom_type[geom])) not in _GEOMS), None)
+    if other is not None:
+        raise InputDataError(
+            f"{path}: body '{name}' has a {_OTHER_GEOMS.get(other, 'shape of another kind')}.",
+            f"{', '.join(_GEOMS.values())}.",
+            "put a box or a mesh in its place.",
+        )
+    parts = [_geometry(model, geom, origin) for geom in solid]
     return LinkOfRobot(
         name=name,
         mass_kg=float(model.body_mass[body]),
@@ -217,7 +283,7 @@ def _link(model: Any, body: int, name: str, origin: Array | None) -> LinkOfRobot
 
 def _geometry(model: Any, geom: int, origin: Array) -> GeometryOfLink:
     kind, size = _GEOMS[int(model.geom_type[geom])], model.geom_size[geom]
-    sizes = {"sphere": size[:1], "capsule": size[:2], "cylinder": size[:2], "box": size[:3], "mesh": size[:0]}[kind]
+    sizes = size[: {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3, "mesh": 0}[kind]]
     mesh = None
     if kind == "mesh":
         data = model.geom_dataid[geom]

@@ -19,6 +19,7 @@ _KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "fix
 
 def read_urdf(path: Path, robot: Element) -> Articulation:
     """Read the tree of a <robot>; see `read_articulation`."""
+    _require_expanded(path, robot)
     links: dict[str, LinkOfRobot] = {}
     for element in robot.findall("link"):
         name = _name(path, element, "link")
@@ -35,6 +36,17 @@ def read_urdf(path: Path, robot: Element) -> Articulation:
             "give the body its shape in capture.toml, without a robot's file.",
         )
     return Articulation.tree(robot.get("name", path.stem), path, links, joints)
+
+
+def _require_expanded(path: Path, robot: Element) -> None:
+    """Refuse a file whose macros would have to be expanded, and so lacks links."""
+    macro = next((one.tag for one in robot.iter() if "xacro" in one.tag.partition("}")[0].lower()), None)
+    if macro is not None:
+        raise InputDataError(
+            f"{path}: it is a xacro file: it has <xacro:{macro.rpartition('}')[2].removeprefix('xacro_')}>.",
+            "a URDF whose macros are expanded.",
+            "run `xacro FILE > robot.urdf`, and name that file.",
+        )
 
 
 def _name(path: Path, element: Element, what: str) -> str:

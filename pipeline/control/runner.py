@@ -40,6 +40,11 @@ class Runner(Protocol):
         """Name of the object."""
         ...
 
+    @property
+    def outside(self) -> tuple[str, ...]:
+        """Names of what the robot's file has beside the robot, and the object does not touch."""
+        ...
+
     def reset(self, seed: int) -> Measured:
         """Put the plant where a run begins, and return its state.
 
@@ -104,6 +109,11 @@ class PushRunner:
         found = self.controller.task_world
         return found.world.body_names[found.object]
 
+    @property
+    def outside(self) -> tuple[str, ...]:
+        """See :class:`Runner`."""
+        return ()
+
     def reset(self, seed: int) -> Measured:
         """See :class:`Runner`."""
         return self.plant.reset(*start_of(self.controller.task_world, seed))
@@ -145,6 +155,11 @@ class HandRunner:
     def object_name(self) -> str:
         """See :class:`Runner`."""
         return self.controller.hand.world.body_names[self.controller.hand.object]
+
+    @property
+    def outside(self) -> tuple[str, ...]:
+        """See :class:`Runner`."""
+        return self.controller.hand.outside
 
     def reset(self, seed: int) -> Measured:
         """See :class:`Runner`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -283,19 +283,26 @@ def _result(
         input_sha256=request.inputs(),
         settings=request.settings,
         versions=versions(),
-        warnings=warnings_of(runner.controller.slow, request.draws, request.model),
+        warnings=warnings_of(runner.controller.slow, request.draws, request.model, runner.outside),
     )
 
 
-def warnings_of(slow: str, draws: int, model: Model) -> tuple[str, ...]:
+def warnings_of(slow: str, draws: int, model: Model, outside: Sequence[str] = ()) -> tuple[str, ...]:
     """Return what a run should be told of.
 
     Args:
         slow: Why predictions run in the slow engine; empty where they do not.
         draws: Draws of the model for each plan.
         model: The model.
+        outside: Names of what the robot's file has outside of its links.
     """
     found = [f"predictions run in the slow engine: {slow}."] if slow else []
+    if outside:
+        names = ", ".join(outside[:5]) + (", ..." if len(outside) > 5 else "")
+        found.append(
+            f"what the robot's file has outside of its links, {names}, is not there in predictions: "
+            "the object does not touch it; give it to the root link."
+        )
     if draws and not any(parameter.std_error for parameter in model.file.parameters):
         found.append(f"--draws {draws}: the model has no standard errors, so that all draws are its estimate.")
     return tuple(found)

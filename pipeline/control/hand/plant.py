@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from ....datasets.robots.mjcf import control_of, servos_of
 from ....schemas import HandPlantSection, HandTask, InputDataError, NotConvergedError, did_you_mean
 from ...physics.chains.joint_command import JointCommand
 from ...physics.chains.state import joints_of
@@ -18,6 +19,9 @@ from ..horizon import Array
 from ..planning import ControlState
 from ..plant import changed_world
 from .world import HandWorld
+
+NO_DYNAMICS, LAGS = 0, (2, 3)
+"""MuJoCo's numbers of actuators that act at once, and of those that lag behind (timeconst)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +146,7 @@ class HandScenePlant:
         self._hand, task = hand, hand.task
         path = task.folder / task.plant.scene
         try:
-            self._model = self._mujoco.MjModel.from_xml_path(str(path))
+            self._model = self._mujoco.MjModel.from_xml_path(str(path.absolute()))
         except ValueError as error:
             found = f"{task.source}: [plant] scene: {path}: MuJoCo cannot read it: {error}."
             raise InputDataError(
@@ -153,6 +157,8 @@ class HandScenePlant:
         self._data = self._mujoco.MjData(self._model)
         self._body = self._object(task, str(path))
         self._places = [self._joint(name, str(path)) for name in hand.joints]
+        self._servos = [servo for _, _, servo in self._places]
+        self._factor, self._offset = np.array([control_of(self._model, servo) for servo in self._servos]).T
         self._change(task.plant)
 
     def reset(self, position_m: Array, quat_wxyz: Array) -> HandTruth:
@@ -161,19 +167,22 @@ class HandScenePlant:
         self._mujoco.mj_resetData(model, data)
         first = model.jnt_qposadr[model.body_jntadr[self._body]]
         data.qpos[first : first + 7] = [*position_m, *quat_wxyz]
-        for (place, _, servo), value in zip(self._places, self._hand.home, strict=True):
-            data.qpos[place], data.ctrl[servo] = value, value
+        data.qpos[[place for place, _, _ in self._places]] = self._hand.home
+        data.ctrl[self._servos] = self._factor * self._hand.home + self._offset
+        for servo in self._servos:
+            if model.actuator_dyntype[servo] != NO_DYNAMICS:  # of a lag, whose output is its control
+                data.act[model.actuator_actadr[servo]] = data.ctrl[servo]
         self._mujoco.mj_forward(model, data)
         return self._truth()
 
     def advance(self, target_rad: Array, interval_s: float) -> HandTruth:
         """See :class:`HandPlant`."""
         data, model = self._data, self._model
-        servos = [servo for _, _, servo in self._places]
         steps = max(1, round(interval_s / model.opt.timestep))
-        first, grip = data.ctrl[servos].copy(), 0.0
+        first, grip = data.ctrl[self._servos].copy(), 0.0
+        last = self._factor * np.asarray(target_rad) + self._offset
         for step in range(1, steps + 1):
-            data.ctrl[servos] = first + (np.asarray(target_rad) - first) * step / steps
+            data.ctrl[self._servos] = first + (last - first) * step / steps
             self._mujoco.mj_step(model, data)
             grip += self._grip() / steps
         found = self._truth(grip)
@@ -216,14 +225,12 @@ class HandScenePlant:
                 todo="correct the name in the task, or add the joint to the scene.",
             )
         number = model.joint(name).id
-        moves = [k for k in range(model.nu) if model.actuator_trntype[k] == 0 and model.actuator_trnid[k, 0] == number]
-        # a motor would take a target for a torque; a servo pulls towards its target, as hard as away from where it is
-        servos = [k for k in moves if model.actuator_gainprm[k, 0] > 0 > model.actuator_biasprm[k, 1]]
-        if not servos:
+        servos = [k for k in servos_of(model, number) if model.actuator_dyntype[k] in (NO_DYNAMICS, *LAGS)]
+        if len(servos) != 1:
             raise InputDataError(
-                f"{path}: joint '{name}' has no servo.",
-                "a position actuator for every joint.",
-                todo="add <position joint=...> for it to the scene.",
+                f"{path}: joint '{name}' has {len(servos) or 'no'} servo{'s' if servos else ''}.",
+                "one position actuator for every joint.",
+                todo=f"{'leave one' if servos else 'add <position joint=...>'} for it in the scene.",
             )
         return int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number]), servos[0]
 

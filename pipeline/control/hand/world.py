@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ....datasets.models.model import Model
-from ....datasets.robots import Articulation, read_articulation
+from ....datasets.robots import Articulation, JointOfRobot, read_articulation
 from ....schemas import HandTask, InputDataError, require_joints
 from ....schemas.materials import pair_of
 from ...geometry.directions import fibonacci_directions
@@ -36,6 +36,8 @@ OBJECT, LINK = "the object", "a link"
 """Materials of the object, and prefix of those of links with a friction of their own."""
 WHOLE_CORNERS = 12
 """Largest number of corners of the hulls by which links touch each other."""
+SLACK = 1e-3
+"""Largest excess of a range of targets over that of the file, which may have been rounded [rad or m]."""
 DIRECTIONS = 200
 """Points of each ball of an object whose hull gets fewer corners."""
 
@@ -58,6 +60,8 @@ class HandWorld:
     """Largest targets [rad], shape (joints,)."""
     home: Array
     """Values of the joints at the start [rad], shape (joints,)."""
+    outside: tuple[str, ...]
+    """Names of what collides in the file of the hand and belongs to no link: the object does not touch it."""
 
     @property
     def object(self) -> int:
@@ -149,7 +153,7 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
     }
     chain, bodies = _touching(task, hand, *_shaped(task, chain, links, shapes))
     world = world_of(model, task, chain, bodies)
-    limits = [_limits(task, joint) for joint in chain.moving]
+    limits = [_limits(task, joint) for joint in hand.joints]
     lower, upper = (np.array(side) for side in zip(*limits, strict=True))
     home = np.array([task.start.joints.get(joint, min(max(0.0, low), high))
                      for joint, (low, high) in zip(moving, limits, strict=True)])  # fmt: skip
@@ -161,7 +165,9 @@ def hand_world(model: Model, task: HandTask) -> HandWorld:
             f"{lower[k]:g} to {upper[k]:g} rad, its limits.",
             "correct the value.",
         )
-    found = HandWorld(task=task, model=model, world=world, joints=moving, lower=lower, upper=upper, home=home)
+    found = HandWorld(
+        task=task, model=model, world=world, joints=moving, lower=lower, upper=upper, home=home, outside=hand.outside
+    )
     begun = found.state(task.start.position_m, task.start.quat_wxyz, dict(zip(moving, home.tolist(), strict=True)))
     require_apart(world, begun, f"{task.source}, the start")
     _require_reach(found)
@@ -257,9 +263,17 @@ def _require_room(found: HandWorld) -> None:
     )
 
 
-def _limits(task: HandTask, joint: Joint) -> tuple[float, float]:
-    low, high = task.limits.joints.get(joint.name, (-math.inf, math.inf))
-    return max(low, float(joint.lower[0])), min(high, float(joint.upper[0]))
+def _limits(task: HandTask, joint: JointOfRobot) -> tuple[float, float]:
+    """Return the smallest and the largest target of a joint: those of its file, or of the task within them."""
+    low, high = max(joint.lower, joint.lowest_target), min(joint.upper, joint.highest_target)
+    wanted = task.limits.joints.get(joint.name, (low, high))
+    if wanted[0] < low - SLACK or wanted[1] > high + SLACK:
+        raise InputDataError(
+            f"{task.source}: [limits] joints: '{joint.name}' = {wanted[0]:g} to {wanted[1]:g}.",
+            f"a range within that of the file, {low:g} to {high:g} {'m' if joint.kind == 'slide' else 'rad'}.",
+            "correct the range.",
+        )
+    return max(low, wanted[0]), min(high, wanted[1])
 
 
 def _shaped(

@@ -99,13 +99,13 @@ def mesh_of_part(part: GeometryOfLink) -> Mesh:
 
 
 def _points_of(part: GeometryOfLink) -> Array:
-    """Return points whose hull is a box, ball, cylinder or capsule about the origin."""
+    """Return points whose hull is a box, ball, ellipsoid, cylinder or capsule about the origin."""
     if part.kind == "box":
         signs = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij"), -1).reshape(-1, 3)
         return signs * np.array(part.size_m)
     directions = fibonacci_directions(_ROUND_POINTS)
-    if part.kind == "sphere":
-        return part.size_m[0] * directions
+    if part.kind in ("sphere", "ellipsoid"):
+        return np.array(part.size_m) * directions
     radius, half = part.size_m
     if part.kind == "capsule":
         return radius * directions + half * np.sign(directions[:, 2:]) * np.array([0.0, 0.0, 1.0])

@@ -1,5 +1,6 @@
 """URDF and MJCF: what is read, and what is refused."""
 
+import math
 import re
 from pathlib import Path
 
@@ -8,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.robots import read_articulation
+from cgwm.datasets.robots.mjcf import control_of, servos_of
 from cgwm.pipeline.physics.chains.articulated import Servo, chain_of
-from cgwm.pipeline.sg_gs.collision.link_spheres import link_spheres
+from cgwm.pipeline.sg_gs.collision.link_spheres import link_mesh, link_spheres
 from cgwm.schemas import InputDataError, UsageError
 
 ARM = """<robot name="arm">
@@ -132,6 +134,11 @@ def test_an_mjcf_file_has_its_servos_anchors_and_several_joints_of_a_body(tmp_pa
         ("<robot", "<sdf", "it is not XML"),
         ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>', "joint 'rail' has an axis of length 0"),
         ('lower="-1" upper="2"', 'lower="2" upper="-1"', "joint 'shoulder' has the limits 2 to -1"),
+        (
+            '<link name="foot"/>',
+            '<link name="foot"/><xacro:finger side="l"/>',
+            "it is a xacro file: it has <xacro:finger>",
+        ),
     ],
 )
 def test_what_a_chain_cannot_be_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -153,6 +160,17 @@ def test_what_a_chain_cannot_be_is_refused(tmp_path: Path, old: str, new: str, m
             '<actuator><motor name="pull" tendon="t"/></actuator>',
             "actuator 'pull' does not act on a joint",
         ),
+        (
+            "",
+            '<actuator><intvelocity name="v" joint="z" kp="2" actrange="-1 1"/></actuator>',
+            "actuator 'v' has dynamics",
+        ),
+        ("", 2 * '<actuator><position joint="z" kp="2"/></actuator>', "joint 'z' has 2 servos"),
+        (
+            "",
+            '<actuator><position name="p" joint="z" kp="2" forcerange="-1 0"/></actuator>',
+            "'p' pulls in one direction",
+        ),
     ],
 )
 def test_what_pulls_otherwise_than_a_servo_is_refused(tmp_path: Path, joint: str, more: str, message: str) -> None:
@@ -160,6 +178,65 @@ def test_what_pulls_otherwise_than_a_servo_is_refused(tmp_path: Path, joint: str
       </body></worldbody>{more}</mujoco>"""
     with pytest.raises(InputDataError, match=re.escape(message)):
         read_articulation(written(tmp_path, text, "arm.xml"))
+
+
+SERVED = """<mujoco><compiler angle="radian"/><worldbody><geom name="floor" type="plane" size="1 1 1"/>
+  <body name="base"><geom size="0.1"/>
+    <body name="link"><joint name="z" range="-2 2" damping="0.1"/><geom type="%s" size="0.03 0.02 0.01"/></body></body>
+  </worldbody><actuator>%s</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("actuators", "gain", "damping", "force", "targets"),
+    [
+        ('<position joint="z" kp="2" kv="0.3" gear="3" forcerange="-1 1"/>', 18.0, 2.8, 3.0, (-math.inf, math.inf)),
+        ('<motor joint="z"/><position joint="z" kp="2" ctrlrange="-0.5 1"/>', 2.0, 0.1, math.inf, (-0.5, 1.0)),
+        (
+            '<general joint="z" biastype="affine" gainprm="4" biasprm="1 -2 -0.3" ctrlrange="-1 1"/>',
+            2.0, 0.4, math.inf, (-1.5, 2.5),
+        ),
+        ('<position joint="z" kp="2" gear="-1" ctrlrange="-0.5 1"/>', 2.0, 0.1, math.inf, (-1.0, 0.5)),
+    ],
+)  # fmt: skip
+def test_a_servo_pulls_as_in_mujoco_from_its_control_to_rest(
+    tmp_path: Path, actuators: str, gain: float, damping: float, force: float, targets: tuple[float, float]
+) -> None:
+    path = written(tmp_path, SERVED % ("ellipsoid", actuators), "arm.xml")
+    found = read_articulation(path)
+    joint = next(one for one in found.joints if one.name == "z")
+    assert (joint.stiffness, joint.damping, joint.torque_limit) == pytest.approx((gain, damping, force))
+    assert (joint.lowest_target, joint.highest_target) == pytest.approx(targets) and found.outside == ("floor",)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    servo = servos_of(model, 0)[0]
+    factor, offset = control_of(model, servo)
+    data.qpos[0] = 0.3
+    for target, torque in ((0.3, 0.0), (0.35, 0.05 * gain)):
+        data.ctrl[servo] = factor * target + offset
+        mujoco.mj_forward(model, data)
+        assert data.qfrc_actuator[0] == pytest.approx(torque, abs=1e-12)
+
+
+def test_a_plane_on_a_link_is_refused(tmp_path: Path) -> None:
+    text = SERVED.replace('<geom size="0.1"/>', '<geom type="plane" size="1 1 1"/>') % ("sphere", "")
+    with pytest.raises(InputDataError, match="body 'base' has a plane"):
+        read_articulation(written(tmp_path, text, "arm.xml"))
+
+
+def test_an_ellipsoid_reaches_as_far_as_its_axes(tmp_path: Path) -> None:
+    found = read_articulation(written(tmp_path, SERVED % ("ellipsoid", ""), "arm.xml"))
+    np.testing.assert_allclose(np.ptp(link_mesh(found.links[1]).vertices, axis=0), (0.06, 0.04, 0.02), rtol=0.02)
+
+
+def test_includes_are_found_from_the_file_that_names_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "robot" / "parts").mkdir(parents=True)
+    written(
+        tmp_path, "<mujoco><worldbody><body><joint/><geom size='0.1'/></body></worldbody></mujoco>", "robot/parts/b"
+    )
+    written(tmp_path, '<mujoco><include file="b"/></mujoco>', "robot/parts/a")
+    written(tmp_path, '<mujoco><include file="parts/a"/></mujoco>', "robot/arm.xml")
+    monkeypatch.chdir(tmp_path)
+    assert len(read_articulation("robot/arm.xml").joints) == 1
 
 
 def test_spheres_need_a_closed_mesh(tmp_path: Path) -> None:

@@ -153,6 +153,11 @@ def test_draws_of_a_model_without_standard_errors_are_told() -> None:
     assert [len(stage.warnings_of("", draws, model)) for draws in (0, 4) for model in (unsure, sure)] == [0, 0, 0, 1]
 
 
+def test_what_a_robots_file_has_beside_the_robot_is_told() -> None:
+    (told,) = stage.warnings_of("", 0, pushed_model(visible=False), ("floor", "table"))
+    assert "outside of its links, floor, table, is not there in predictions" in told
+
+
 def test_advice_and_intervals() -> None:
     task = push_task(planner={"control_hz": 20.0, "samples": 16})
     assert advice(task, 0.1) == (

@@ -14,6 +14,7 @@ from cgwm.pipeline.control.loop import Sensor, run
 from cgwm.pipeline.control.mujoco_plant import MujocoPlant
 from cgwm.pipeline.control.plant import ModelPlant, Truth
 from cgwm.pipeline.control.task_world import task_world
+from cgwm.schemas import InputDataError
 from helpers import fused_host
 from helpers.pushing import RADIUS, push_task, pushed_model, write_cube
 from helpers.small_model import HALF, MASS
@@ -51,6 +52,25 @@ def test_a_steady_push_takes_the_force_of_friction(kind: str, errors: dict, expe
     assert force[0] == pytest.approx(expected, rel=0.05)
     moved = steady[-1].position_m - steady[0].position_m
     assert moved[0] == pytest.approx(0.1 * DT * (len(steady) - 1), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "message"), [(1e3, 0.0, "measure 173 m, the model's object 0.17"), (1.0, 0.1, "lies 0.1 m from")]
+)
+def test_a_true_mesh_in_other_units_or_another_frame_is_refused(
+    scale: float, shift: float, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / write_cube(tmp_path)
+    lines = [line.split() for line in path.read_text().splitlines()]
+    moved = [
+        " ".join(["v", str(scale * float(x) + shift), *(str(scale * float(one)) for one in rest)])
+        if kind == "v" else " ".join((kind, x, *rest))
+        for kind, x, *rest in lines
+    ]  # fmt: skip
+    path.write_text("\n".join(moved))
+    found = task_world(pushed_model(), push_task(str(tmp_path / "T"), plant={"kind": "mujoco", "meshes": [path.name]}))
+    with pytest.raises(InputDataError, match=message):
+        MujocoPlant(found)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -235,6 +235,21 @@ def test_both_plants_move_the_joint_that_is_commanded(controller: HandController
     )
 
 
+def test_gears_and_offsets_of_a_servo_do_not_move_its_targets(tmp_path: Path, model: Model) -> None:
+    geared = '<position joint="swing" kp="2" kv="0.1" gear="3"/>'
+    general = '<general joint="lift" biastype="affine" gainprm="4" biasprm="0.5 -2 -0.1" ctrlrange="-2 2"/>'
+    write_hand(tmp_path, servos=geared + general)
+    hand = hand_world(model, hand_task(tmp_path, limits={"joints": {"lift": (-0.2, 0.5)}}))
+    assert (hand.lower.tolist(), hand.upper.tolist()) == ([-1.5, -0.2], [1.5, 0.5])
+    plant = HandScenePlant(hand)
+    plant.reset(np.array([0.0, 0.06, 0.05]), np.array([1.0, 0, 0, 0]))
+    for _ in range(20):
+        truth = plant.advance(np.array([-0.5, 0.1]), 0.05)
+    np.testing.assert_allclose(truth.joints_rad, (-0.5, 0.1), atol=0.02)
+    with pytest.raises(InputDataError, match=r"\[limits\] joints: 'swing' = -90 to 90"):  # in degrees
+        hand_world(model, hand_task(tmp_path, limits={"joints": {"swing": (-90, 90)}}))
+
+
 def test_a_motor_of_the_scene_is_no_servo(folder: Path, model: Model) -> None:
     """It would take a target for a torque."""
     servo = '<position joint="lift" kp="2" kv="0.1"/>'
