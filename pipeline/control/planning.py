@@ -23,6 +23,9 @@ from .solvers import Solver
 
 SENT = 512
 """Commands that are kept, from which late states are predicted forward."""
+FARTHEST = 10.0
+"""Largest distance of a joint from the middle of its limits, in units of half of their range: beyond it the position is
+in other units, degrees or millimetres."""
 UNIT_TOLERANCE = 0.01
 """Largest deviation of a measured quaternion's length from 1."""
 
@@ -80,17 +83,53 @@ class ControlState:
         """
         for name, size in (("position_m", 3), ("quat_wxyz", 4), ("velocity_m_s", 3), ("omega_body_rad_s", 3)):
             value = getattr(self, name)
-            if value is not None and (np.shape(value) != (size,) or not np.isfinite(value).all()):
+            needed = value is not None or not name.startswith(("velocity", "omega"))
+            if needed and not np.isfinite(_numbers(value, size)).all():
                 return f"{name} is not {size} finite numbers"
-        if abs(np.linalg.norm(self.quat_wxyz) - 1) > UNIT_TOLERANCE:
+        if abs(np.linalg.norm(_numbers(self.quat_wxyz, 4)) - 1) > UNIT_TOLERANCE:
             return "quat_wxyz has not the length 1"
-        wrong = [name for name in joints if not math.isfinite(self.joints.get(name, math.nan))]
-        if wrong:
-            return f"joint '{wrong[0]}' has no finite position"
-        wrong = [name for name, value in (self.joint_speeds or {}).items() if not math.isfinite(value)]
-        if wrong:
-            return f"joint '{wrong[0]}' has no finite speed"
-        return "" if math.isfinite(self.time_s) else "time_s is not finite"
+        for what, given in (("position", self.joints or {}), ("speed", self.joint_speeds)):
+            wrong = [name for name in joints if given is not None and not math.isfinite(_number(given.get(name, 0.0)))]
+            missing = [name for name in joints if what == "position" and name not in (given or {})]
+            if wrong or missing:
+                return f"joint '{(wrong + missing)[0]}' has no finite {what}"
+        return "" if math.isfinite(_number(self.time_s)) else "time_s is not finite"
+
+    def of(self, joints: Sequence[str]) -> ControlState:
+        """Return the state as arrays and numbers, with the joints of a robot alone: others may be measured, too."""
+
+        def known(given: Mapping[str, float] | None) -> dict[str, float] | None:
+            return None if given is None else {name: float(given[name]) for name in joints if name in given}
+
+        def array(given: Array | None) -> Array | None:
+            return None if given is None else np.asarray(given, float)
+
+        return ControlState(
+            time_s=float(self.time_s),
+            joints=known(self.joints) or {},
+            position_m=np.asarray(self.position_m, float),
+            quat_wxyz=np.asarray(self.quat_wxyz, float),
+            velocity_m_s=array(self.velocity_m_s),
+            omega_body_rad_s=array(self.omega_body_rad_s),
+            joint_speeds=known(self.joint_speeds),
+        )
+
+
+def _number(value: object) -> float:
+    """Return a value as a number; nan for what is none, such as a text."""
+    try:
+        return math.nan if isinstance(value, str) else float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def _numbers(value: object, size: int) -> Array:
+    """Return values as numbers (size,); nan for what is none."""
+    try:
+        found = np.asarray(value, float)
+    except (TypeError, ValueError):
+        return np.full(size, np.nan)
+    return found if found.shape == (size,) else np.full(size, np.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +195,7 @@ class PlanningController(ABC):
         self._found: tuple[PlanObjective, Tensor] | None = None
         self._command: dict[str, float] = {}
         self._sent: deque[tuple[float, Array]] = deque(maxlen=SENT)
-        self._last_s, self._bad, self.held = -math.inf, 0, 0
+        self._last_s, self._bad, self._fault, self.held = -math.inf, 0, "", 0
 
     @property
     def lost(self) -> bool:
@@ -220,7 +259,7 @@ class PlanningController(ABC):
         plan = self.plan(state, now_s)
         if self.lost:
             raise NotConvergedError(
-                f"{self._bad} states in a row are missing, stale or no numbers.",
+                f"{self._bad} states in a row are missing, stale or no numbers; the last one: {self._fault}.",
                 todo="stop the robot, and check what measures the state.",
             )
         if plan is None:
@@ -246,6 +285,21 @@ class PlanningController(ABC):
             found[name] = min(max(min(max(value, last - reach), last + reach), low), high)
         return found
 
+    def _fault_of(self, state: ControlState | None, acts_s: float | None) -> str:
+        """Return why no plan can be made from a state, in words; empty for nothing."""
+        if state is None:
+            return "there is none"
+        fault = state.fault(self.joints)
+        if fault or (acts_s is not None and not math.isfinite(_number(acts_s))):
+            return fault or "the time of the command is not finite"
+        if state.time_s <= self._last_s:
+            return f"its time, {state.time_s:.6g} s, is not later than {self._last_s:.6g} s"
+        for name in self.joints:
+            low, high, _ = self.limits(name)
+            if abs(state.joints[name] - 0.5 * (low + high)) > FARTHEST * 0.5 * (high - low):
+                return f"joint '{name}' is at {state.joints[name]:g}, far from its limits, {low:g} to {high:g}"
+        return ""
+
     @one_torch_thread()
     def plan(self, state: ControlState | None, acts_s: float | None = None) -> ControlPlan | None:
         """Return a plan from a measured state; None for a state that is missing, stale or no numbers.
@@ -254,10 +308,12 @@ class PlanningController(ABC):
             state: The measured state.
             acts_s: Time from which the plan will act [s], by default that of the state.
         """
-        if state is None or state.fault(self.joints) or state.time_s <= self._last_s:
+        self._fault = self._fault_of(state, acts_s)
+        if state is None or self._fault:
             self.held += 1
             self._bad += 1
             return None
+        state = state.of(self.joints)
         self._bad, self._last_s = 0, state.time_s
         wall, cpu = time.perf_counter(), time.process_time()
         objective, warm = self._objective(state, state.time_s if acts_s is None else max(acts_s, state.time_s))

@@ -79,7 +79,8 @@ def test_bad_states_hold_the_last_command_are_counted_and_stop_the_run() -> None
     with pytest.raises(NotConvergedError) as caught:
         controller.command(None)
     assert str(caught.value) == (
-        "5 states in a row are missing, stale or no numbers.\nNext: stop the robot, and check what measures the state."
+        "5 states in a row are missing, stale or no numbers; the last one: there is none.\n"
+        "Next: stop the robot, and check what measures the state."
     )
     assert controller.held == 10
 
@@ -91,12 +92,30 @@ def test_bad_states_hold_the_last_command_are_counted_and_stop_the_run() -> None
         ({"quat_wxyz": np.ones(4)}, "quat_wxyz has not the length 1"),
         ({"joints": {"x": 0.0}}, "joint 'y' has no finite position"),
         ({"time_s": math.nan}, "time_s is not finite"),
+        ({"quat_wxyz": None}, "quat_wxyz is not 4 finite numbers"),
+        ({"position_m": ["0", "far", "0"]}, "position_m is not 3 finite numbers"),
+        ({"joints": {"x": "0.0", "y": 0.0}}, "joint 'x' has no finite position"),
+        ({"joints": None}, "joint 'x' has no finite position"),
+        ({"joint_speeds": {"y": None}}, "joint 'y' has no finite speed"),
         ({"velocity_m_s": np.array([0, math.inf, 0])}, "velocity_m_s is not 3 finite numbers"),
         ({}, ""),
     ],
 )
 def test_a_state_says_what_is_wrong_with_it(changes: dict, words: str) -> None:
     assert replace(GOOD, **changes).fault() == words
+
+
+def test_states_of_a_robot_with_more_joints_serve_and_those_in_other_units_are_told() -> None:
+    alone, more = (Controller(pushed_model(), push_task(planner={"bad_states": 2})) for _ in range(2))
+    joints = {**GOOD.joints, "wrist": math.nan}
+    listed = [0.0, 0.0, float(GOOD.position_m[2])]
+    state = at(0.1, joints=joints, joint_speeds={"wrist": 1.0}, position_m=listed, quat_wxyz=[1, 0, 0, 0])
+    command = alone.command(at(0.1, position_m=np.array(listed), quat_wxyz=np.array([1.0, 0, 0, 0])))
+    assert more.command(state) == more.command(at(0.2), math.nan) == command and more.held == 1
+    for _ in range(2):
+        more.plan(at(0.3, joints={"x": -60.0, "y": 0.0}))
+    with pytest.raises(NotConvergedError, match="joint 'x' is at -60, far from its limits"):
+        more.command(at(0.4, joints={"x": -60.0, "y": 0.0}))
 
 
 def test_worst_draws_cost_more_than_all() -> None:
