@@ -7,6 +7,7 @@ descent, including its random generators: a resumed fit gives the same spheres a
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import re
@@ -15,7 +16,7 @@ import time
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -31,7 +32,9 @@ Array = NDArray[Any]
 
 _KEY = "made_of.json"
 """File that names what the fit is made of."""
-_OWN = re.compile(r"[\w-]*-[0-9a-f]{8}\.npz|\..*\.partial-.*")
+_LOCK = "lock"
+"""File that the process holds which writes the checkpoints; it lets go when it ends, however it does."""
+_OWN = re.compile(r"lock|[\w-]*-[0-9a-f]{8}\.npz|\..*\.partial-.*")
 """Names of the other files of a checkpoint, and of unfinished ones."""
 
 
@@ -49,6 +52,7 @@ class Checkpoint:
         self._made_of = dict(made_of)
         self._every_s = every_s
         self._last = time.monotonic()
+        self._lock: IO[str] | None = None
 
     @staticmethod
     def of(out: Path, made_of: Mapping[str, str]) -> Checkpoint:
@@ -60,8 +64,8 @@ class Checkpoint:
         """Return the checkpoints of the work that writes `out`; existing ones are kept if it resumes.
 
         Raises:
-            UsageError: If the directory exists and holds no checkpoints, if it does and neither `resume` nor
-                `overwrite` is set, or if the fit to resume had other settings or inputs.
+            UsageError: If the directory exists and holds no checkpoints, if another process writes them, if they are
+                there and neither `resume` nor `overwrite` is set, or if the fit to resume had other settings or inputs.
         """
         checkpoint = Checkpoint.of(out, made_of)
         path = checkpoint.path
@@ -74,6 +78,11 @@ class Checkpoint:
             raise UsageError(
                 f"{path} is in the way: checkpoints go there, and it holds none.",
                 todo="move it, or choose another --out.",
+            )
+        if not checkpoint._held():
+            raise UsageError(
+                f"{path}: another process is writing {work} of {out} now.",
+                todo="wait until it has ended, or choose another --out.",
             )
         if resume:
             checkpoint._refuse_others()
@@ -103,6 +112,23 @@ class Checkpoint:
         """Remove all checkpoints, when the model is complete."""
         if (self.path / _KEY).is_file():
             shutil.rmtree(self.path)
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def _held(self) -> bool:
+        """Hold the directory for this process, and return whether no other one does."""
+        if self._lock is None:
+            self._lock = (self.path / _LOCK).open("a", encoding="utf-8")
+        try:
+            fcntl.lockf(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            self._lock.close()
+            self._lock = None
+            return False
+        except OSError:  # a file system without locks
+            return True
+        return True
 
     def due(self) -> bool:
         """Return whether the last checkpoint is at least `every_s` old."""
@@ -112,6 +138,7 @@ class Checkpoint:
         """Write a state atomically."""
         if not (self.path / _KEY).is_file():
             self.path.mkdir(parents=True, exist_ok=True)
+            self._held()
             with replaced_file(self.path / _KEY) as path:
                 path.write_text(json.dumps(self._made_of, indent=1) + "\n", encoding="utf-8")
         with replaced_file(self.path / _file_name(name)) as path:

@@ -69,7 +69,7 @@ def test_a_resumed_fit_gives_the_same_spheres(tmp_path, capture, settings, monke
     hulls = []
     # of the same photos each time
     monkeypatch.setattr(bodies, "carve", lambda *given: (hulls or hulls.append(carve(*given)) or hulls)[0])
-    whole = fit_scene(capture, config, Checkpoint(tmp_path / "short", MADE_OF))
+    whole = fit_scene(capture, config, Checkpoint(tmp_path / "short", MADE_OF, every_s=600.0))
     assert not list(tmp_path.iterdir())  # nothing is written by a short fit
     for stopped_after in (3, 5):  # again and again, in the midst of one descent or another
         written = 0
@@ -121,6 +121,22 @@ def test_what_was_interrupted_is_neither_lost_nor_mixed(tmp_path):
         again.read("background", torch.device("cpu"))
     Checkpoint.beside(out, MADE_OF, resume=False, overwrite=True)
     assert not again.path.exists()
+
+
+def test_what_another_process_is_writing_is_not_taken_for_interrupted(tmp_path):
+    out = tmp_path / "run"
+    mine = Checkpoint.beside(out, MADE_OF, resume=False, overwrite=False)
+    mine.write("background", {"k": 1})
+    mine._lock.close()  # as of a process that was killed
+    hold = "import fcntl, sys; f = open(sys.argv[1], 'a'); fcntl.lockf(f, fcntl.LOCK_EX); print(flush=True); input()"
+    command = [sys.executable, "-S", "-c", hold, str(mine.path / "lock")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
+        for resume in (True, False):
+            with pytest.raises(UsageError, match="another process is writing a run of"):
+                Checkpoint.beside(out, MADE_OF, resume=resume, overwrite=not resume, work="a run")
+        other.communicate(b"\n")
+    assert Checkpoint.beside(out, MADE_OF, resume=True, overwrite=False).path.exists()
 
 
 def test_a_folder_of_that_name_that_is_no_checkpoint_stays(tmp_path):
