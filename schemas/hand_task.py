@@ -62,20 +62,20 @@ class HandServoSection(TaskSection):
     """Numbers of all servos in place of those of the file; needed where it has none, as a URDF."""
 
     stiffness: Positive | None = None
-    """Gain [N m/rad]."""
+    """Gain [N m/rad, of slides N/m]."""
     damping: Annotated[float, Field(ge=0, le=1e9)] | None = None
-    """Damping [N m s/rad]."""
+    """Damping [N m s/rad, of slides N s/m]."""
     armature: Annotated[float, Field(ge=0, le=1e9)] | None = None
-    """Reflected inertia of the motors [kg m2]."""
+    """Reflected inertia of the motors [kg m2, of slides kg]."""
 
 
 class HandLimitsSection(TaskSection):
     """Limits that no command exceeds."""
 
     speed_rad_s: Positive = 8.0
-    """Largest speed of a joint's target [rad/s]."""
+    """Largest speed of a joint's target [rad/s, of slides m/s]."""
     joints: dict[str, Range] = {}
-    """Smallest and largest target of single joints [rad]; by default those of the file."""
+    """Smallest and largest target of single joints [rad, of slides m]; by default those of the file."""
 
 
 class HandGoalSection(TaskSection):
@@ -101,7 +101,7 @@ class HandStartSection(TaskSection):
     turn_deg: tuple[Angle, Angle] = (0.0, 0.0)
     """A further turn about the goal's axis, drawn for each seed, from and to [deg]."""
     joints: dict[str, float] = {}
-    """Values of the joints [rad], to which plans may return; 0, or the nearest limit, for those left out."""
+    """Values of the joints [rad, of slides m], to which plans may return; 0, or the nearest limit, for those left out."""
 
 
 class HandCostsSection(TaskSection):

@@ -301,7 +301,7 @@ def warnings_of(slow: str, draws: int, model: Model, outside: Sequence[str] = ()
         names = ", ".join(outside[:5]) + (", ..." if len(outside) > 5 else "")
         found.append(
             f"what the robot's file has outside of its links, {names}, is not there in predictions: "
-            "the object does not touch it; give it to the root link."
+            "the object does not touch it. Give the root link a box where the object needs one."
         )
     if draws and not any(parameter.std_error for parameter in model.file.parameters):
         found.append(f"--draws {draws}: the model has no standard errors, so that all draws are its estimate.")
