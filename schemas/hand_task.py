@@ -101,7 +101,7 @@ class HandStartSection(TaskSection):
     turn_deg: tuple[Angle, Angle] = (0.0, 0.0)
     """A further turn about the goal's axis, drawn for each seed, from and to [deg]."""
     joints: dict[str, float] = {}
-    """Values of the joints [rad, of slides m], to which plans may return; 0, or the nearest limit, for those left out."""
+    """Values of the joints [rad, of slides m], to which plans may return; left out: 0, or the nearest limit."""
 
 
 class HandCostsSection(TaskSection):

@@ -17,13 +17,12 @@ from .goal import turned
 from .horizon import Array
 from .plant import Truth
 from .task_world import TaskWorld, ground_z
+from .true_shape import box_of_balls, require_same_body
 
 CONVEX_EXCESS = 0.05
 """Largest excess of the volume of a part's hull over its own: MuJoCo takes the hull of a mesh."""
 SOLREF, SOLIMP = (0.008, 1.0), (0.97, 0.97, 0.001)
 """Contacts of MuJoCo: time constant [s], damping ratio; impedance. Nothing of the fitted contact is in them."""
-MOST_RATIO, MOST_AWAY = 2.0, 0.25
-"""Largest ratio of the sizes of true mesh and model, and largest distance of their middles in units of that size."""
 SMALLEST_GAP_M = 1e-3
 """Smallest gap of object and finger at the start [m]: MuJoCo pushes apart what begins in overlap."""
 
@@ -187,34 +186,9 @@ def _parts(found: TaskWorld) -> list[Mesh]:
                 "cut the mesh into convex parts, and list them under [plant] meshes.",
             )
         parts.append(Mesh(mesh.vertices, mesh.faces))
-    _require_same_body(found, parts)
+    true = np.stack([end([end(part.vertices, 0) for part in parts], 0) for end in (np.min, np.max)])
+    require_same_body(f"{found.task.source}: [plant] meshes", box_of_balls(*found.surface), true)
     return [Mesh(found.task.plant.size_factor * part.vertices, part.faces) for part in parts]
-
-
-def _require_same_body(found: TaskWorld, parts: list[Mesh]) -> None:
-    """Check that the true mesh has about the size and the place of the model's object.
-
-    Raises:
-        InputDataError: If it has not: in other units, or in a frame of its own.
-    """
-    centers, radii = found.surface
-    ours = np.stack(((centers - radii[:, None]).min(0), (centers + radii[:, None]).max(0)))
-    theirs = np.stack([end([end(part.vertices, 0) for part in parts], 0) for end in (np.min, np.max)])
-    size, true = (float(np.linalg.norm(np.ptp(box, axis=0))) for box in (ours, theirs))
-    away = float(np.linalg.norm(ours.mean(0) - theirs.mean(0)))
-    where = f"{found.task.source}: [plant] meshes: together they measure {true:.3g} m"
-    if not 1 / MOST_RATIO < true / size < MOST_RATIO:
-        raise InputDataError(
-            f"{where}, the model's object {size:.3g} m.",
-            "the true mesh of the object that the model has, in metres.",
-            "scale the meshes, or name those of this object.",
-        )
-    if away > MOST_AWAY * size:
-        raise InputDataError(
-            f"{where}, and their middle lies {away:.3g} m from that of the model's object.",
-            f"up to {MOST_AWAY * size:.3g} m: meshes in the object's frame.",
-            "move the meshes by what the frames differ.",
-        )
 
 
 def _text(values: Any) -> str:

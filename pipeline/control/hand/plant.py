@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ....datasets.robots.mjcf import control_of, servos_of
+from ....datasets.shapes.turns import matrix_of
 from ....schemas import HandPlantSection, HandTask, InputDataError, NotConvergedError, did_you_mean
 from ...physics.chains.joint_command import JointCommand
 from ...physics.chains.state import joints_of
@@ -18,6 +19,7 @@ from ...physics.state import State
 from ..horizon import Array
 from ..planning import ControlState
 from ..plant import changed_world
+from ..true_shape import box_of_balls, require_same_body
 from .world import HandWorld
 
 NO_DYNAMICS, LAGS = 0, (2, 3)
@@ -159,6 +161,9 @@ class HandScenePlant:
         self._places = [self._joint(name, str(path)) for name in hand.joints]
         self._servos = [servo for _, _, servo in self._places]
         self._factor, self._offset = np.array([control_of(self._model, servo) for servo in self._servos]).T
+        found = hand.world.bodies[hand.object]
+        ours = box_of_balls(found.centers[0].numpy(), found.radii[0].numpy())
+        require_same_body(f"{path}: body '{task.plant.body}'", ours, self._box())
         self._change(task.plant)
 
     def reset(self, position_m: Array, quat_wxyz: Array) -> HandTruth:
@@ -212,6 +217,17 @@ class HandScenePlant:
                 "correct [plant] body.",
             )
         return free[task.plant.body]
+
+    def _box(self) -> Array:
+        """Return the smallest and largest coordinates (2, 3) of the object in its frame [m]."""
+        model, corners = self._model, []
+        first = model.body_geomadr[self._body]
+        for geom in range(first, first + model.body_geomnum[self._body]):
+            middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+            signs = np.stack(np.meshgrid(*3 * [[-1.0, 1.0]]), -1).reshape(-1, 3)
+            corners.append((middle + signs * half) @ matrix_of(model.geom_quat[geom]).T + model.geom_pos[geom])
+        every = np.concatenate(corners)
+        return np.stack((every.min(0), every.max(0)))
 
     def _joint(self, name: str, path: str) -> tuple[int, int, int]:
         """Return the places of a joint's value and speed, and the number of its servo."""

@@ -55,7 +55,8 @@ def test_a_steady_push_takes_the_force_of_friction(kind: str, errors: dict, expe
 
 
 @pytest.mark.parametrize(
-    ("scale", "shift", "message"), [(1e3, 0.0, "measure 173 m, the model's object 0.17"), (1.0, 0.1, "lies 0.1 m from")]
+    ("scale", "shift", "message"),
+    [(1e3, 0.0, "true object measures 173 m"), (1.0, 0.1, "lies 0.1 m from")],
 )
 def test_a_true_mesh_in_other_units_or_another_frame_is_refused(
     scale: float, shift: float, message: str, tmp_path: Path

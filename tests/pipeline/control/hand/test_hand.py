@@ -34,6 +34,7 @@ from cgwm.schemas import (
 from helpers import fused_host
 from helpers.paddles import JOINTS, hand_task, write_hand
 from helpers.pushing import pushed_model
+from helpers.small_model import HALF
 from typer.testing import CliRunner
 
 pytestmark = [
@@ -248,6 +249,13 @@ def test_gears_and_offsets_of_a_servo_do_not_move_its_targets(tmp_path: Path, mo
     np.testing.assert_allclose(truth.joints_rad, (-0.5, 0.1), atol=0.02)
     with pytest.raises(InputDataError, match=r"\[limits\] joints: 'swing' = -90 to 90"):  # in degrees
         hand_world(model, hand_task(tmp_path, limits={"joints": {"swing": (-90, 90)}}))
+
+
+def test_an_object_of_the_scene_in_other_units_is_refused(folder: Path, model: Model) -> None:
+    large = (folder / "scene.xml").read_text().replace(f'size="{HALF} {HALF} {HALF}"', 'size="50 50 50"')
+    (folder / "large.xml").write_text(large)
+    with pytest.raises(InputDataError, match="body 'thing': the true object measures 173 m"):
+        HandScenePlant(hand_world(model, hand_task(folder, plant={"kind": "mujoco", "scene": "large.xml"})))
 
 
 def test_a_motor_of_the_scene_is_no_servo(folder: Path, model: Model) -> None:
