@@ -76,7 +76,7 @@ def _model_of(path: Path) -> Any:
 
 
 def _require_plain_joints(path: Path, model: Any) -> None:
-    """Refuse springs, tendons that pull, and actuators of anything but joints, which chains do not have.
+    """Refuse springs, values that do not begin at 0, tendons that pull, and actuators of anything but joints.
 
     Raises:
         InputDataError: With the first of them.
@@ -85,8 +85,10 @@ def _require_plain_joints(path: Path, model: Any) -> None:
     losses = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_limited)
     tendons = np.flatnonzero(sum(map(_sizes, losses)))
     others = np.flatnonzero(model.actuator_trntype != 0)
+    shifted = [k for k in range(model.njnt) if model.jnt_type[k] in (2, 3) and model.qpos0[model.jnt_qposadr[k]] != 0]
     for found in (
         *(f"joint '{model.joint(k).name}' has a spring" for k in springs),
+        *(f"joint '{model.joint(k).name}' is not 0 where the file draws it (ref)" for k in shifted),
         *(f"tendon '{model.tendon(k).name}' has a spring, damping, friction or limits" for k in tendons),
         *(f"actuator '{model.actuator(k).name}' does not act on a joint" for k in others),
         *_odd_servos(model),

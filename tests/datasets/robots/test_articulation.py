@@ -153,6 +153,7 @@ def test_what_a_chain_cannot_be_is_refused(tmp_path: Path, old: str, new: str, m
     ("joint", "more", "message"),
     [
         ('stiffness="0.1"', "", "joint 'z' has a spring"),
+        ('ref="10"', "", "joint 'z' is not 0 where the file draws it"),
         ("", '<tendon><fixed name="t" stiffness="3"><joint joint="z" coef="1"/></fixed></tendon>', "tendon 't' has a"),
         (
             "",
