@@ -148,7 +148,7 @@ def _joints(runs: Sequence[PageRun]) -> str:
         lines.append(Series(name=names[joint], points=_thinned(time, values), color=color))
         lines.append(Series(name=f"{names[joint]}, target", points=_thinned(time, target), color=color, kind="dashed"))
     told = f"Seed {runs[0].figures.seed}, the joints that move most of {len(names)}; dashed: their targets."
-    plot = plot_svg(Plot(title="Joint [rad]", x="time [s]", series=lines))
+    plot = plot_svg(Plot(title="Joint [rad, of slides m]", x="time [s]", series=lines))
     return section("Joints", paragraph(told), plot, legend(lines))
 
 
