@@ -22,6 +22,8 @@ from ..plant import changed_world
 from ..true_shape import box_of_balls, require_same_body
 from .world import HandWorld
 
+GRAVITY_TOLERANCE = 0.02
+"""Largest difference of the gravity of scene and model, in units of the larger."""
 NO_DYNAMICS, LAGS = 0, (2, 3)
 """MuJoCo's numbers of actuators that act at once, and of those that lag behind (timeconst)."""
 
@@ -164,7 +166,18 @@ class HandScenePlant:
         found = hand.world.bodies[hand.object]
         ours = box_of_balls(found.centers[0].numpy(), found.radii[0].numpy())
         require_same_body(f"{path}: body '{task.plant.body}'", ours, self._box())
+        self._require_gravity(str(path))
         self._change(task.plant)
+
+    def _require_gravity(self, path: str) -> None:
+        """Check that the scene has the gravity of the model."""
+        ours, theirs = self._hand.world.gravity[0].numpy(), self._model.opt.gravity
+        if np.linalg.norm(theirs - ours) > GRAVITY_TOLERANCE * max(np.linalg.norm(ours), np.linalg.norm(theirs)):
+            raise InputDataError(
+                f"{path}: its gravity is {theirs.tolist()} m/s2.",
+                f"about that of the model, {ours.round(3).tolist()}.",
+                todo='write <option gravity="..."/>, or turn the scene: hand and object have the frame of the model.',
+            )
 
     def reset(self, position_m: Array, quat_wxyz: Array) -> HandTruth:
         """See :class:`HandPlant`."""

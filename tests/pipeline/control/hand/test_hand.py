@@ -251,6 +251,14 @@ def test_gears_and_offsets_of_a_servo_do_not_move_its_targets(tmp_path: Path, mo
         hand_world(model, hand_task(tmp_path, limits={"joints": {"swing": (-90, 90)}}))
 
 
+def test_a_scene_with_another_gravity_is_refused(folder: Path, model: Model) -> None:
+    (folder / "up.xml").write_text(
+        (folder / "scene.xml").read_text().replace("<option ", '<option gravity="0 -9.81 0" ')
+    )
+    with pytest.raises(InputDataError, match=r"its gravity is \[0.0, -9.81, 0.0\]"):
+        HandScenePlant(hand_world(model, hand_task(folder, plant={"kind": "mujoco", "scene": "up.xml"})))
+
+
 def test_an_object_of_the_scene_in_other_units_is_refused(folder: Path, model: Model) -> None:
     large = (folder / "scene.xml").read_text().replace(f'size="{HALF} {HALF} {HALF}"', 'size="50 50 50"')
     (folder / "large.xml").write_text(large)
