@@ -132,6 +132,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         here = _of(rows, task=task, engine=engine)
         if here:
             parts.append(f"**{task.capitalize()}, {engine}**\n\n{_pooled(here)}")
+    parts += ["## Learned rivals by capture", _learned(rows)]
     parts += ["## Captures", _counts(rows), "## Not run", _not_run(rows)]
     return "\n\n".join(parts) + "\n"
 
@@ -172,6 +173,29 @@ def _over_engines(rows: Sequence[dict[str, Any]]) -> str:
 
 def _median_mean(values: Sequence[float], digits: int) -> str:
     return f"{np.median(values):.{digits}f}, {np.mean(values):.{digits}f}" if values else "–"
+
+
+def _learned(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the learned rivals in each of their captures, mm / deg / dB, and how they differ from cgwm over all."""
+    shown = [name for name in (REFERENCE, FLOOR, *LEARNED) if captures_of(rows, name)]
+    rivals = [name for name in shown if name in LEARNED]
+    found = {name: captures_of(rows, name) for name in shown}
+    lines = _head(("capture", *(ROWS[name] for name in shown)))
+    for capture in sorted(set().union(*(found[name] for name in rivals)), key=lambda one: (TASKS.index(one[1]), one)):
+        engine, task, obj, ground, _ = capture
+        cells = [
+            " / ".join(f"{found[name][capture][key]:.1f}" for key in (_MM, _DEG, _DB))
+            if capture in found[name]
+            else "–"
+            for name in shown
+        ]
+        lines.append(f"| {task}, {obj.replace('_', ' ')}, {ground}, {engine} | " + " | ".join(cells) + " |")
+    lines += ["", *_head(("row", "captures", "worse than cgwm in", "to cgwm: mm", "deg", "dB"))]
+    for name in rivals:
+        gaps = paired(found[name], found[REFERENCE], _MM)
+        cells = [difference(found[name], found[REFERENCE], key) for key in (_MM, _DEG, _DB)]
+        lines.append(f"| {ROWS[name]} | {len(gaps)} | {int((gaps > 0).sum())} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def _not_run(rows: Sequence[dict[str, Any]]) -> str:

@@ -178,7 +178,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         found = [row["errors"] for row in here if "errors" in row]
         if found:
             cells = [
-                f"{100 * np.median([one[name] for one in found]):.1f} (to {100 * max(one[name] for one in found):.0f})"
+                f"{100 * np.median([one[name] for one in found]):.1f} (to {100 * max(one[name] for one in found):.1f})"
                 for name in KNOWN
             ]
             lines.append(f"| {task} | {engine} | {len(found)} | " + " | ".join(cells) + " |")
