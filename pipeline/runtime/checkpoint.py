@@ -7,7 +7,6 @@ descent, including its random generators: a resumed fit gives the same spheres a
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import re
@@ -28,6 +27,11 @@ from ...schemas import InputDataError, UsageError
 
 State = dict[str, Any]
 """State of a descent: tensors, numbers, text, and lists and dictionaries of them."""
+try:
+    import fcntl
+except ImportError:  # no POSIX: two processes are not told apart there
+    fcntl = None
+
 Array = NDArray[Any]
 
 _KEY = "made_of.json"
@@ -118,6 +122,8 @@ class Checkpoint:
 
     def _held(self) -> bool:
         """Hold the directory for this process, and return whether no other one does."""
+        if fcntl is None:
+            return True
         if self._lock is None:
             self._lock = (self.path / _LOCK).open("a", encoding="utf-8")
         try:
