@@ -12,11 +12,18 @@ from pathlib import Path
 from typing import TypeVar
 
 from ...datasets.io.atomic import remove_directory, replaced_file
+from ...datasets.io.directory_lock import NAME as LOCK_NAME
+from ...datasets.io.directory_lock import DirectoryLock
 from ...schemas import FileModel, UsageError, read_json
 
 DocumentT = TypeVar("DocumentT", bound=FileModel)
 
 _KEY = "made_of.json"
+
+
+def _is_ours(name: str) -> bool:
+    """Return whether a file is what a ladder leaves that was killed before it had a key."""
+    return name == LOCK_NAME or name.startswith(f".{_KEY}.")
 
 
 class LadderFiles:
@@ -30,12 +37,14 @@ class LadderFiles:
 
     Raises:
         UsageError: If the directory holds something else, or an interrupted ladder and neither is set, or one that was
-            made of something else.
+            made of something else, or if another process writes it.
     """
 
     def __init__(self, out: Path, made_of: Mapping[str, str], resume: bool, overwrite: bool) -> None:
         self._out, self.path = out, self.path_of(out)
+        self._lock = DirectoryLock(self.path)
         if (self.path / _KEY).is_file():
+            self._require_alone()
             if not resume and not overwrite:
                 raise UsageError(
                     f"{self.path} holds a ladder of {out} that was interrupted.",
@@ -45,13 +54,14 @@ class LadderFiles:
                 self.remove()
             else:
                 self._refuse_others(made_of)
-        elif self.path.exists() and any(not entry.name.startswith(f".{_KEY}.") for entry in self.path.iterdir()):
+        elif self.path.exists() and not all(_is_ours(entry.name) for entry in self.path.iterdir()):
             raise UsageError(
                 f"{self.path} is in the way: an unfinished ladder goes there, and it holds none.",
                 todo="move it, or choose another --out.",
             )
         if not (self.path / _KEY).is_file():
             self.path.mkdir(parents=True, exist_ok=True)
+            self._require_alone()
             with replaced_file(self.path / _KEY) as path:
                 path.write_text(json.dumps(dict(made_of), indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
@@ -77,6 +87,14 @@ class LadderFiles:
         """Remove the directory, when the ladder is complete or is to begin again."""
         if (self.path / _KEY).is_file():
             remove_directory(self.path, self._out)
+        self._lock.release()
+
+    def _require_alone(self) -> None:
+        if not self._lock.hold():
+            raise UsageError(
+                f"{self.path}: another process is writing the ladder of {self._out} now.",
+                todo="wait until it has ended, or choose another --out.",
+            )
 
     def _refuse_others(self, made_of: Mapping[str, str]) -> None:
         found = json.loads((self.path / _KEY).read_text(encoding="utf-8"))

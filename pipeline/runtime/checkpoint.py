@@ -15,7 +15,7 @@ import time
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,22 +23,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.io.atomic import replaced_file
+from ...datasets.io.directory_lock import NAME as LOCK_NAME
+from ...datasets.io.directory_lock import DirectoryLock
 from ...schemas import InputDataError, UsageError
 
 State = dict[str, Any]
 """State of a descent: tensors, numbers, text, and lists and dictionaries of them."""
-try:
-    import fcntl
-except ImportError:  # no POSIX: two processes are not told apart there
-    fcntl = None
-
 Array = NDArray[Any]
 
 _KEY = "made_of.json"
 """File that names what the fit is made of."""
-_LOCK = "lock"
-"""File that the process holds which writes the checkpoints; it lets go when it ends, however it does."""
-_OWN = re.compile(r"lock|[\w-]*-[0-9a-f]{8}\.npz|\..*\.partial-.*")
+_OWN = re.compile(LOCK_NAME + r"|[\w-]*-[0-9a-f]{8}\.npz|\..*\.partial-.*")
 """Names of the other files of a checkpoint, and of unfinished ones."""
 
 
@@ -56,7 +51,7 @@ class Checkpoint:
         self._made_of = dict(made_of)
         self._every_s = every_s
         self._last = time.monotonic()
-        self._lock: IO[str] | None = None
+        self._lock = DirectoryLock(path)
 
     @staticmethod
     def of(out: Path, made_of: Mapping[str, str]) -> Checkpoint:
@@ -83,7 +78,7 @@ class Checkpoint:
                 f"{path} is in the way: checkpoints go there, and it holds none.",
                 todo="move it, or choose another --out.",
             )
-        if not checkpoint._held():
+        if not checkpoint._lock.hold():
             raise UsageError(
                 f"{path}: another process is writing {work} of {out} now.",
                 todo="wait until it has ended, or choose another --out.",
@@ -116,25 +111,7 @@ class Checkpoint:
         """Remove all checkpoints, when the model is complete."""
         if (self.path / _KEY).is_file():
             shutil.rmtree(self.path)
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
-
-    def _held(self) -> bool:
-        """Hold the directory for this process, and return whether no other one does."""
-        if fcntl is None:
-            return True
-        if self._lock is None:
-            self._lock = (self.path / _LOCK).open("a", encoding="utf-8")
-        try:
-            fcntl.lockf(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, PermissionError):
-            self._lock.close()
-            self._lock = None
-            return False
-        except OSError:  # a file system without locks
-            return True
-        return True
+        self._lock.release()
 
     def due(self) -> bool:
         """Return whether the last checkpoint is at least `every_s` old."""
@@ -144,7 +121,7 @@ class Checkpoint:
         """Write a state atomically."""
         if not (self.path / _KEY).is_file():
             self.path.mkdir(parents=True, exist_ok=True)
-            self._held()
+            self._lock.hold()
             with replaced_file(self.path / _KEY) as path:
                 path.write_text(json.dumps(self._made_of, indent=1) + "\n", encoding="utf-8")
         with replaced_file(self.path / _file_name(name)) as path:

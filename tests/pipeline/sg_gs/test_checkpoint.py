@@ -5,12 +5,15 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
+from cgwm.datasets.io.directory_lock import NAME as LOCK_NAME
 from cgwm.datasets.models.fit_inputs import photo_inputs
 from cgwm.datasets.models.model import read_model
+from cgwm.pipeline.improve.ladder_files import LadderFiles
 from cgwm.pipeline.optimization.adam import Adam
 from cgwm.pipeline.runtime.checkpoint import Checkpoint
 from cgwm.pipeline.sg_gs import bodies
@@ -127,16 +130,29 @@ def test_what_another_process_is_writing_is_not_taken_for_interrupted(tmp_path):
     out = tmp_path / "run"
     mine = Checkpoint.beside(out, MADE_OF, resume=False, overwrite=False)
     mine.write("background", {"k": 1})
-    mine._lock.close()  # as of a process that was killed
+    ladder = LadderFiles(out.with_name("ladder"), MADE_OF, resume=False, overwrite=False)
+    for one in (mine, ladder):
+        one._lock.release()  # as of a process that was killed
+        with held_by_another(one.path / LOCK_NAME):
+            for resume in (True, False):
+                with pytest.raises(UsageError, match=r"another process is writing (a run|the ladder) of"):
+                    if one is mine:
+                        Checkpoint.beside(out, MADE_OF, resume=resume, overwrite=not resume, work="a run")
+                    else:
+                        LadderFiles(out.with_name("ladder"), MADE_OF, resume=resume, overwrite=not resume)
+    assert Checkpoint.beside(out, MADE_OF, resume=True, overwrite=False).path.exists()
+    assert LadderFiles(out.with_name("ladder"), MADE_OF, resume=False, overwrite=True).path.exists()
+
+
+@contextmanager
+def held_by_another(lock):
+    """Hold a lock in another process."""
     hold = "import fcntl, sys; f = open(sys.argv[1], 'a'); fcntl.lockf(f, fcntl.LOCK_EX); print(flush=True); input()"
-    command = [sys.executable, "-S", "-c", hold, str(mine.path / "lock")]
+    command = [sys.executable, "-S", "-c", hold, str(lock)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         other.stdout.readline()
-        for resume in (True, False):
-            with pytest.raises(UsageError, match="another process is writing a run of"):
-                Checkpoint.beside(out, MADE_OF, resume=resume, overwrite=not resume, work="a run")
+        yield
         other.communicate(b"\n")
-    assert Checkpoint.beside(out, MADE_OF, resume=True, overwrite=False).path.exists()
 
 
 def test_a_folder_of_that_name_that_is_no_checkpoint_stays(tmp_path):
