@@ -33,8 +33,8 @@ class Commands(Protocol):
         """Length of a command [s]."""
         ...
 
-    def command(self, state: ControlState | None) -> dict[str, float]:
-        """Return targets by joint name."""
+    def command(self, state: ControlState | None, now_s: float | None = None) -> dict[str, float]:
+        """Return targets by joint name, for a command that acts from a time [s] on."""
         ...
 
 
@@ -67,11 +67,10 @@ class ControlNode:
     def _pose(self, message: Any) -> None:
         self.pose = message
 
-    def state(self) -> ControlState | None:
-        """Return the newest state; None where joints or object were not measured lately."""
-        if self.joints is None or self.pose is None:
+    def state(self, now: float) -> ControlState | None:
+        """Return the newest state at a time [s]; None where joints or object were not measured lately."""
+        if self.joints is None or self.pose is None or len(self.joints.position) != len(self.joints.name):
             return None
-        now = 1e-9 * self.node.get_clock().now().nanoseconds
         measured = seconds(self.pose.header.stamp)
         if now - min(measured, seconds(self.joints.header.stamp)) > STALE * self.controller.interval_s:
             return None
@@ -80,14 +79,17 @@ class ControlNode:
         return ControlState(
             time_s=measured,
             joints=dict(zip(self.joints.name, self.joints.position, strict=True)),
-            joint_speeds=dict(zip(self.joints.name, speeds, strict=True)) if len(speeds) else None,
+            joint_speeds=dict(zip(self.joints.name, speeds, strict=True))
+            if len(speeds) == len(self.joints.name)
+            else None,
             position_m=np.array([place.x, place.y, place.z]),
             quat_wxyz=np.array([turn.w, turn.x, turn.y, turn.z]),
         )
 
     def tick(self) -> None:
         """Publish the targets at the end of the next command."""
-        targets = self.controller.command(self.state())
+        now = 1e-9 * self.node.get_clock().now().nanoseconds
+        targets = self.controller.command(self.state(now), now)  # what happens since the state is predicted
         if not targets:
             return
         message, point = self.messages.JointTrajectory(), self.messages.JointTrajectoryPoint()

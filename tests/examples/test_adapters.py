@@ -28,9 +28,11 @@ class Steps:
 
     def __init__(self, joint: str) -> None:
         self.joint, self.seen, self.bad, self.last = joint, [], 0, {}
+        self.now_s: float | None = None
 
-    def command(self, state: Any) -> dict[str, float]:
+    def command(self, state: Any, now_s: float | None = None) -> dict[str, float]:
         self.seen.append(state)
+        self.now_s = now_s
         self.bad = 0 if state is not None else self.bad + 1
         if self.bad >= 2:
             raise NotConvergedError("2 states in a row are missing.")
@@ -124,6 +126,7 @@ def test_ros_topics_become_states_and_commands_trajectories() -> None:
     fake.nanoseconds = 12_550_000_000
     node.tick()
     state = controller.seen[-1]
+    assert controller.now_s == pytest.approx(12.55)  # later than the state, which is predicted forward
     assert (state.time_s, state.joints, state.joint_speeds) == (12.5, {"b": 0.5, "a": 0.25}, None)
     assert (state.position_m.tolist(), state.quat_wxyz.tolist()) == ([1, 2, 3], [0, 0, 0, 1])
     sent = fake.published[-1]
@@ -134,3 +137,14 @@ def test_ros_topics_become_states_and_commands_trajectories() -> None:
     assert fake.published[-1].points[0].positions == [0.35]
     with pytest.raises(NotConvergedError):
         node.tick()
+
+
+def test_joint_states_without_positions_are_no_state() -> None:
+    """A driver may publish efforts alone."""
+    ros, fake, controller = example("ros2_control"), FakeNode(), Steps("a")
+    node = ros.ControlNode(fake, controller, messages())
+    pose = SimpleNamespace(position=SimpleNamespace(x=1, y=2, z=3), orientation=SimpleNamespace(x=0, y=0, z=1, w=0))
+    fake.callbacks["object_pose"](SimpleNamespace(header=stamped(0, 0), pose=pose))
+    fake.callbacks["joint_states"](SimpleNamespace(header=stamped(0, 0), name=["a"], position=[], velocity=[]))
+    node.tick()
+    assert controller.seen == [None]
