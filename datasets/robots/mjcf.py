@@ -41,7 +41,7 @@ def read_mjcf(path: Path) -> Articulation:
     if len(trees) != 1:
         names = ", ".join(model.body(body).name for body in trees)
         raise InputDataError(
-            f"{path}: it has {len(trees)} bodies in the world: {names}.",
+            f"{path}: it has {f'{len(trees)} bodies in the world: {names}' if trees else 'no body in the world'}.",
             "one tree of bodies.",
             "put the robot under one body of the world, or name a file with that body alone.",
         )
@@ -87,10 +87,10 @@ def _require_plain_joints(path: Path, model: Any) -> None:
     others = np.flatnonzero(model.actuator_trntype != 0)
     shifted = [k for k in range(model.njnt) if model.jnt_type[k] in (2, 3) and model.qpos0[model.jnt_qposadr[k]] != 0]
     for found in (
-        *(f"joint '{model.joint(k).name}' has a spring" for k in springs),
-        *(f"joint '{model.joint(k).name}' is not 0 where the file draws it (ref)" for k in shifted),
+        *(f"joint {_called(model.joint(k))} has a spring" for k in springs),
+        *(f"joint {_called(model.joint(k))} is not 0 where the file draws it (ref)" for k in shifted),
         *(f"tendon '{model.tendon(k).name}' has a spring, damping, friction or limits" for k in tendons),
-        *(f"actuator '{model.actuator(k).name}' does not act on a joint" for k in others),
+        *(f"actuator {_called(model.actuator(k))} does not act on a joint" for k in others),
         *_odd_servos(model),
     ):
         raise InputDataError(
@@ -103,13 +103,18 @@ def _require_plain_joints(path: Path, model: Any) -> None:
 def _odd_servos(model: Any) -> Iterator[str]:
     """Yield what no servo of a chain can do: follow its target late, or pull in one direction alone."""
     lags = np.flatnonzero(model.actuator_dyntype != 0)
-    yield from (f"actuator '{model.actuator(k).name}' has dynamics of its own (intvelocity, timeconst)" for k in lags)
+    yield from (f"actuator {_called(model.actuator(k))} has dynamics of its own (intvelocity, timeconst)" for k in lags)
     for joint in range(model.njnt):
         servos = servos_of(model, joint)
         if len(servos) > 1:
-            yield f"joint '{model.joint(joint).name}' has {len(servos)} servos"
+            yield f"joint {_called(model.joint(joint))} has {len(servos)} servos"
         if servos and not largest_force(model, joint, servos[0]) > 0:
-            yield f"actuator '{model.actuator(servos[0]).name}' pulls in one direction alone, by its range of forces"
+            yield f"actuator {_called(model.actuator(servos[0]))} pulls in one direction alone, by its range of forces"
+
+
+def _called(found: Any) -> str:
+    """Return the name of a joint or an actuator for a message; its number, from 0, where it has none."""
+    return f"'{found.name}'" if found.name else f"number {found.id}"
 
 
 def _sizes(numbers: Array) -> Array:

@@ -166,6 +166,7 @@ def test_what_a_chain_cannot_be_is_refused(tmp_path: Path, old: str, new: str, m
             '<actuator><intvelocity name="v" joint="z" kp="2" actrange="-1 1"/></actuator>',
             "actuator 'v' has dynamics",
         ),
+        ("", '<actuator><position jointinparent="z" kp="2"/></actuator>', "actuator number 0 does not act on a joint"),
         ("", 2 * '<actuator><position joint="z" kp="2"/></actuator>', "joint 'z' has 2 servos"),
         (
             "",
