@@ -171,5 +171,5 @@ class _Fits:
         if int(np.argmax((self.base.fit.chi2 - fit.chi2) / self.spread)) > 0:
             return alone
         # an effect on the rebound has to predict what slip does not
-        beside = gains_beside_slip(self.base, problem, fit) / float(self.spread[0])
+        beside = gains_beside_slip(self.base, problem, fit, float(self.spread[0]))
         return min(alone, replace(one, gains=tuple(beside.tolist())), key=lambda found: found.gain_t)

@@ -3,6 +3,10 @@
 A force may also swing: at so many periods in a usual flight, in one of four phases. A torque that swings does so about
 an axis of the world, since none that a body has of its own is known to any effect.
 
+A constant force may be that of a place: of a spring towards it, of a vortex about it, or one that grows along a way
+across the room. Such a force is another one at the other end of a flight, and constant in none, but a few short flights
+from one hand pass the same places. It has further numbers beside the constant force, which cost what they do in BIC.
+
 What a law is least known in is the coordinate that it follows: a drag that is none is likelier to follow the speed in
 another way than to act on one side of the room. Before the data, the families of such coordinates are together as
 likely as all others. Nothing is known that pushes a body in one direction of the world, by how fast it spins.
@@ -83,13 +87,14 @@ def _known_powers(named: tuple[str, ...]) -> set[int]:
     return {power for (drag, power), other in OTHER_DRAG.items() if drag in named[:1] and other in named}
 
 
-def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) -> list[Family]:
+def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...], of_places: bool = True) -> list[Family]:
     """Return the forms of a force, in families of one coordinate.
 
     Args:
         motion: The flights.
         own: The force.
         named: Names of the effect and of its equals; what one of these is, is no other form.
+        of_places: Whether to include forces that have further numbers, which change from place to place.
     """
     same = "the same torque" if bool(own.turning.any()) else "the same force"
     place = dict(zip(("x", "y", "height"), motion.com_m.unbind(-1), strict=True))
@@ -108,6 +113,9 @@ def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) ->
         Family(coordinate, {f"{same} {words}": own.times(factor) for words, factor in factors.items()}, then)
         for coordinate, (factors, then) in found.items()
     ]
+    if of_places and _is_constant(own):
+        place = next(family for family in families if family.coordinate == "place")
+        place.forms.update(_of_places(motion, own))
     return [family for family in (*families, _swinging(motion, own)) if family.forms]
 
 
@@ -164,6 +172,24 @@ def _where(motion: FlownMotion, name: str, values: Tensor) -> Mapping[str, Tenso
     on = (values > edge).double()
     words = {f"where {name} is above {edge:.2g} m": on, f"where {name} is below {edge:.2g} m": 1 - on}
     return {**words, f"times {name}": values}
+
+
+def _of_places(motion: FlownMotion, own: ForceField) -> Mapping[str, ForceField]:
+    """Return a constant force beside one that changes from place to place, along the directions of the constant one."""
+    basis = torch.linalg.qr(own.acceleration[0, 0]).Q
+    away = motion.com_m - motion.com_m[motion.inside].mean(0)
+    along = (away @ basis @ basis.T)[..., None]
+    up, level = motion.axes
+    found = {"a force towards a place, which grows with the distance": [along]}
+    if basis.shape[1] > 1:
+        around = torch.linalg.cross(up[:, 0].expand_as(away), away)[..., None]
+        found["a force around a place, which grows with the distance"] = [around]
+    across = away @ level
+    found["a force that changes across the room"] = [own.acceleration * across[..., None, k : k + 1] for k in range(2)]
+    return {
+        words: ForceField.joined([own, *(ForceField(one, torch.zeros_like(one)) for one in more)])
+        for words, more in found.items()
+    }
 
 
 def _how_fast(motion: FlownMotion, name: str, vectors: Tensor, named: tuple[str, ...] = ()) -> Mapping[str, Tensor]:

@@ -229,7 +229,7 @@ def own_form(whole: Segments, world: World, std_m_s2: float) -> OwnForm:
     motion = FlownMotion(whole.in_world(world))
     level = motion.axes[1].expand(*motion.times_s.shape, 3, 2).clone()
     own = ForceField(level, torch.zeros_like(level))
-    families = families_of(motion, own, ("gravity_tilt",))
+    families = families_of(motion, own, ("gravity_tilt",), of_places=False)
     fields = [own, *(field for family in families for field in family.forms.values())]
     parameters, rows, jacobian = derivatives(motion.flight, world, ())
     states = jacobian[..., len(parameters) :]

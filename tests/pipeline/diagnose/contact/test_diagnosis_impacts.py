@@ -305,3 +305,15 @@ def test_a_rebound_that_falls_with_the_slip_is_no_rebound_that_falls_with_the_sp
 def test_bounces_of_one_episode_are_predicted_by_none() -> None:
     rows = np.array([[1.0, 0.2, 0.1], [1.0, 0.4, 0.3]])
     assert held_out_gains(rows, np.array([0.5, 0.6]), np.ones(2), np.zeros(2, np.int64)).tolist() == [0.0]
+
+
+def test_the_only_impact_that_slips_tells_nothing_of_the_speed() -> None:
+    """Three episodes have slow impacts that roll, the last one also a fast one that slips and rebounds less."""
+    slip, fast = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.45]), np.array([0.1, 0.2, 0.15, 0.25, 0.1, 1.0])
+    rows = np.stack([np.ones(6), slip, slip**2, fast], 1)
+    value, sigma = np.array([0.01, -0.01, 0.0, -0.02, 0.01, -0.2]), np.full(6, 0.02)
+    episode = np.repeat(np.arange(3), 2)
+    assert abs(held_out_gains(rows, value, sigma, episode)[2]) < 1
+    rolling = rows * np.array([1.0, 0.0, 0.0, 1.0])  # where nothing slips, the same fall is one of the speed
+    rolling[:4, 3], value[:4] = [0.1, 1.0, 0.2, 0.9], [0.0, -0.2, -0.02, -0.18]
+    assert held_out_gains(rolling, value, sigma, episode)[2] > 5

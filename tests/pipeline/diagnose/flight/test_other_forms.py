@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose.flight.form_families import Family, weights_of
 from cgwm.pipeline.diagnose.flight.other_forms import OtherForms, _forces, log_mean, other_forms, own_form
@@ -78,6 +79,28 @@ class Fan(Effect):
         return Wrench(force=motion.mass[:, None] * values["f"][:, None] * on)
 
 
+class Attractor(Effect):
+    """a = k (line - x) level, which is in no library."""
+
+    name = "attractor"
+    summary = formula = reveals = source = "a = k (line - x), level"
+    parameters = (EffectParameter(name="k", unit="1/s2", scale=0.1, limit=5.0),)
+    phase = "flight"
+    turned = False
+
+    def wrench(self, values: Values, motion: BodyMotion) -> Wrench:
+        x, y, _ = (motion.com.new_tensor([0.4, -0.2, 0.0]) - motion.com).unbind(-1)
+        level = torch.stack((-y, x, 0 * x) if self.turned else (x, y, 0 * x), -1)
+        return Wrench(force=motion.mass[:, None] * values["k"][:, None] * level)
+
+
+class Vortex(Attractor):
+    """a = k up x (line - x), which is in no library."""
+
+    name = "vortex"
+    turned = True
+
+
 def late(time_s: Array) -> Array:
     """Return how far a push upwards from 0.2 s on moves a body [m]."""
     return 0.5 * np.clip(time_s - 0.2, 0.0, None) ** 2
@@ -121,7 +144,13 @@ def forms_of(
 
 
 @pytest.mark.parametrize(
-    ("name", "values"), [("spin_damping", {"d": 0.5}), ("gravity_scale", {"s": 0.03}), ("linear_drag", {"c": 0.3})]
+    ("name", "values"),
+    [
+        ("spin_damping", {"d": 0.5}),
+        ("gravity_scale", {"s": 0.03}),
+        ("gravity_tilt", {"tilt_x": 0.03, "tilt_y": 0.02}),
+        ("linear_drag", {"c": 0.3}),
+    ],
 )
 def test_the_law_of_a_true_effect_is_likelier_than_its_forms(name: str, values: dict[str, float]) -> None:
     assert not form_of(world_with("ball", {name: values}), name).likelier
@@ -131,6 +160,17 @@ def test_the_law_of_a_true_effect_is_likelier_than_its_forms(name: str, values: 
 def test_a_force_that_sets_in_late_or_swings_is_no_other_gravity(push: Callable[[Array], Array], word: str) -> None:
     found = form_of(world_with("ball"), "gravity_scale", push)
     assert found.likelier and word in found.words and "spin" not in found.words
+
+
+@pytest.mark.parametrize(
+    ("effect", "word"),
+    [(Attractor(), "towards a place"), pytest.param(Vortex(), "around a place", marks=pytest.mark.evidence)],
+)
+def test_a_force_of_a_place_is_no_tilt(effect: Effect, word: str) -> None:
+    ball = world_with("ball")
+    pulled = replace(ball, effects=(ActiveEffect.of(effect, {"k": 1.0}, ball.gravity[0, :1]),))
+    found = form_of(pulled, "gravity_tilt")
+    assert found.likelier and word in found.words and "elsewhere" in found.then
 
 
 def test_a_drag_above_a_speed_is_no_drag() -> None:
