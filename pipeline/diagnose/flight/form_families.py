@@ -64,14 +64,13 @@ def own_field(motion: FlownMotion, active: ActiveEffect) -> ForceField | None:
         return field
     up, level = motion.axes
     axes = {**dict.fromkeys(UPWARD, up), **dict.fromkeys(OWN_TILTS, level)}.get(name)
-    if axes is None:
-        return None
-    shape = (*motion.times_s.shape, *axes.shape)
-    return ForceField(axes.expand(shape).clone(), torch.zeros(shape, dtype=torch.float64))
+    return None if axes is None else _everywhere(motion, axes)
 
 
 def laws_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) -> list[ForceField]:
-    """Return the laws of an effect and of its equals, its own the first: a drag that is not told from the other one.
+    """Return the laws of an effect and of its equals that are others, its own the first.
+
+    These are a drag that is not told from the other one, and a constant force.
 
     Args:
         motion: The flights.
@@ -79,7 +78,24 @@ def laws_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) -> lis
         named: Names of the effect and of its equals.
     """
     size = _in_medians(motion, "speed", motion.velocity_m_s)
-    return [own, *(own.times(size**power) for power in _known_powers(named))]
+    steady = _constant(motion, own, named)
+    return [own, *(own.times(size**power) for power in _known_powers(named)), *([] if _is_constant(own) else steady)]
+
+
+def _constant(motion: FlownMotion, own: ForceField, named: tuple[str, ...]) -> list[ForceField]:
+    """Return the constant force that an effect or one of its equals is; none where none is one."""
+    if _is_constant(own):
+        return [own]
+    up, level = motion.axes
+    if "constant_force" in named:
+        return [_everywhere(motion, torch.cat((up, level), 1))]
+    return [_everywhere(motion, level)] if set(OWN_TILTS) & set(named) else []
+
+
+def _everywhere(motion: FlownMotion, axes: Tensor) -> ForceField:
+    """Return forces along axes (3, K), the same in all frames."""
+    shape = (*motion.times_s.shape, *axes.shape)
+    return ForceField(axes.expand(shape).clone(), torch.zeros(shape, dtype=torch.float64))
 
 
 def _known_powers(named: tuple[str, ...]) -> set[int]:
@@ -113,9 +129,10 @@ def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...], of
         Family(coordinate, {f"{same} {words}": own.times(factor) for words, factor in factors.items()}, then)
         for coordinate, (factors, then) in found.items()
     ]
-    if of_places and _is_constant(own):
+    steady = _constant(motion, own, named) if of_places else []
+    if steady:
         place = next(family for family in families if family.coordinate == "place")
-        place.forms.update(_of_places(motion, own))
+        place.forms.update(_of_places(motion, steady[0]))
     return [family for family in (*families, _swinging(motion, own)) if family.forms]
 
 

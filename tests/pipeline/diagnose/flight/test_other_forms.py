@@ -112,13 +112,13 @@ def swinging(time_s: Array) -> Array:
     return time_s / rate - np.sin(rate * time_s) / rate**2
 
 
-def form_of(truth: World, named: str, push: Callable[[Array], Array] | None = None) -> OtherForms:
+def form_of(truth: World, named: str, push: Callable[[Array], Array] | None = None, equal: str = "") -> OtherForms:
     """Return the other forms of an effect that is fitted to tosses of another world, and pushed upwards beside it."""
     episodes = tosses(truth, 3, 4, 0.4, 60.0, NOISE, (0.9, 1.2))
     if push is not None:
         episodes = [(name, {body: _pushed(track, push) for body, track in tracks.items()}) for name, tracks in episodes]
     plain = replace(truth, effects=())
-    return forms_of(plain, episodes, [named])[0]
+    return forms_of(plain, episodes, [named], equal)[0]
 
 
 def _pushed(track: Track, push: Callable[[Array], Array]) -> Track:
@@ -163,13 +163,17 @@ def test_a_force_that_sets_in_late_or_swings_is_no_other_gravity(push: Callable[
 
 
 @pytest.mark.parametrize(
-    ("effect", "word"),
-    [(Attractor(), "towards a place"), pytest.param(Vortex(), "around a place", marks=pytest.mark.evidence)],
+    ("effect", "named", "equal", "word"),
+    [
+        (Attractor(), "gravity_tilt", "", "towards a place"),
+        (Attractor(), "linear_drag", "constant_force", "across the room"),
+        pytest.param(Vortex(), "gravity_tilt", "", "around a place", marks=pytest.mark.evidence),
+    ],
 )
-def test_a_force_of_a_place_is_no_tilt(effect: Effect, word: str) -> None:
+def test_a_force_of_a_place_is_no_constant_force(effect: Effect, named: str, equal: str, word: str) -> None:
     ball = world_with("ball")
     pulled = replace(ball, effects=(ActiveEffect.of(effect, {"k": 1.0}, ball.gravity[0, :1]),))
-    found = form_of(pulled, "gravity_tilt")
+    found = form_of(pulled, named, equal=equal)
     assert found.likelier and word in found.words and "elsewhere" in found.then
 
 
