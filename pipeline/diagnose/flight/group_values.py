@@ -41,6 +41,9 @@ LIMITS = THRESHOLDS.flight
 
 Array = NDArray[np.float64]
 
+ZERO = 1e-6
+"""Usual sizes below which a value is at its limit of zero."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Fitted:
@@ -142,7 +145,8 @@ def with_group_values(
         if step.flagged and step.own_std is None
     }
     before = refit([flight], world, []).cost / scatter + penalty * sum(sizes.values())
-    equals = _likeliest([one for place in _places(world, flight, sizes) for one in _fits(search, place)], before)
+    fits = [one for place in _places(world, flight, sizes) for one in _fits(search, place)]
+    equals = _likeliest([one for one in fits if in_several(one.candidate, one.values)], before)
     equals = [*_with_twins(search, equals[0]), *equals[1:]] if equals else []
     if not 0 < len(equals) <= LIMITS.most_equals:
         return steps, world, flight
@@ -166,6 +170,19 @@ def _likeliest(found: Sequence[_Fitted], before: float) -> list[_Fitted]:
         return []
     helping = sorted((one for one in found if one is not best and one.cost < before), key=lambda one: one.cost)
     return [best, *(one for one in helping if _unproven(best, one))]
+
+
+def in_several(candidate: Candidate, values: Mapping[int, Array]) -> bool:
+    """Return whether more than one group has an effect.
+
+    What cannot be negative and is zero in all groups but one, as a drag, is no law: one group shows what looks like it.
+
+    Args:
+        candidate: The effect.
+        values: Its parameters (k,) by group.
+    """
+    least = np.array([ZERO * parameter.scale for parameter in candidate.effect.parameters])
+    return sum(bool((np.abs(one) > least).any()) for one in values.values()) > 1
 
 
 def _with_twins(search: _Search, one: _Fitted) -> list[_Fitted]:

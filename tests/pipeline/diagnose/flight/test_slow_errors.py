@@ -15,6 +15,7 @@ from cgwm.pipeline.diagnose.flight import findings as flight_findings
 from cgwm.pipeline.diagnose.flight import own_tilt
 from cgwm.pipeline.diagnose.flight import selection as flight_selection
 from cgwm.pipeline.diagnose.flight.findings import _Search
+from cgwm.pipeline.diagnose.flight.group_values import in_several
 from cgwm.pipeline.diagnose.flight.own_accelerations import OwnAccelerations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.flight.rest_tilts import rests_confirm  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.flight.selection import FlightSelection
@@ -301,6 +302,19 @@ def test_an_effect_that_each_group_has_of_its_own_is_named_for_groups(drags: tup
         for episode, c in (("0", drags[0]), ("1", drags[1])):
             mine = [value["linear_drag.c"] for name, value in values.items() if name.startswith(episode)]
             assert np.allclose(mine, c, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "several"),
+    [
+        ("linear_drag", ([0.0], [0.08]), False),
+        ("linear_drag", ([0.0], [0.08], [0.1]), True),
+        ("gravity_tilt", ([0.01, 0.0], [0.0, 0.02]), True),
+    ],
+)
+def test_a_drag_that_one_group_alone_has_is_none(name: str, values: tuple[list[float], ...], several: bool) -> None:
+    by_group = {k: np.array(value) for k, value in enumerate(values)}
+    assert in_several(Candidate(name, load_effect(name)), by_group) == several
 
 
 @pytest.mark.evidence
