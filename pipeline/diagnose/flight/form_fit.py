@@ -87,7 +87,8 @@ class FormFit:
         """Return the cost of flights in the parameters of their world and in forms of an effect, its own first.
 
         Without a force, a body moves as with it less what the force does along the motion as it was: that is exact,
-        where the derivative by its parameter also has what the force does to its own change of the motion.
+        where the derivative by its parameter also has what the force does to its own change of the motion. What is no
+        force, as a scale, does more than the force that it is compared as: its own law is the effect itself.
 
         Args:
             motion: The flights.
@@ -130,7 +131,7 @@ class FormFit:
             prior=_placed(rest, [width**-2.0 for width in widths], last),
             without=_placed(taken, [-float(values[k]) for k in own], last),
             rest=rest,
-            forms=[list(range(a, b)) for a, b in itertools.pairwise(ends)],
+            forms=_forms(ends, [] if active.effect.has("wrench") else own),
             more=list(further.values()),
             others=list(others.values()),
             values=_placed(range(count), values.tolist(), last),
@@ -177,6 +178,12 @@ class FormFit:
         step = fixed.copy()
         step[places] += _inverse(matrix) @ (score - information @ fixed)[places]
         return step
+
+
+def _forms(ends: Sequence[int], own: list[int]) -> list[list[int]]:
+    """Return the places of the numbers of each form, that of the first one those of the effect where there are any."""
+    found = [list(range(a, b)) for a, b in itertools.pairwise(ends)]
+    return [own, *found[1:]] if own else found
 
 
 def by_episode(flight: Segments, linear: Linear) -> tuple[Array, Array]:
