@@ -197,6 +197,27 @@ class ImpactThresholds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FlatImpactThresholds(ImpactThresholds):
+    """An effect of contact is named in impacts of a body that falls flat on a face."""
+
+    score: float = threshold(
+        12.0,
+        "chi2",
+        "score from which an effect is named",
+        "by argument: twice that of a ball, whose impacts are exact",
+    )
+    carriers: int = threshold(
+        3, "episodes", "fewest held-out ones of which each has the share `sliding.carries` of the gain", BY_ARGUMENT
+    )
+    told: tuple[str, ...] = threshold(
+        ("velocity_restitution",),
+        "effects",
+        "what flat impacts tell: a face that comes down askew takes more of slow impacts, as adhesion does",
+        BY_ARGUMENT,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SegmentsThresholds:
     """An effect of contact is named under the model's contact law."""
 

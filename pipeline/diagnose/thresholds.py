@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass, field
 
 from ..trajectories.thresholds import BY_ARGUMENT, threshold
-from .contact_thresholds import ImpactThresholds, SegmentsThresholds, SlidingThresholds
+from .contact_thresholds import FlatImpactThresholds, ImpactThresholds, SegmentsThresholds, SlidingThresholds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -511,6 +511,8 @@ class Thresholds:
     """Sliding test."""
     impact: ImpactThresholds = field(default_factory=ImpactThresholds)
     """Impact test."""
+    flat_impact: FlatImpactThresholds = field(default_factory=FlatImpactThresholds)
+    """Impact test of a body that falls flat on a face."""
     segments: SegmentsThresholds = field(default_factory=SegmentsThresholds)
     """Test in contact segments, and separation of flight equals."""
     experiment: ExperimentThresholds = field(default_factory=ExperimentThresholds)

@@ -21,7 +21,7 @@ from ...optimization.tails import f_tail
 from ...physics.contact_law import ContactLaw
 from ...segments.candidates import Candidate, Variant
 from ...segments.impacts.fit import BASE, ImpactBase, ImpactFit, fit_impacts
-from ...segments.impacts.velocities import measured_impacts
+from ...segments.impacts.velocities import Impacts, measured_impacts
 from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ..evidence.evidence import Evidence
 from ..thresholds import THRESHOLDS, ImpactThresholds
@@ -53,7 +53,7 @@ class ImpactTest(ContactTest):
         """
         if not isinstance(data.world.contact, ContactLaw):
             return []
-        impacts = measured_impacts(data.prepared, data.world)
+        impacts = self.impacts(data)
         if impacts is None or len(impacts) < SEGMENT_THRESHOLDS.impact_data.least:
             return []
         base = ImpactBase.of(data.world, impacts)
@@ -69,6 +69,10 @@ class ImpactTest(ContactTest):
         if not order[0].test.admissible or not self._without_gains.passed(order[0]):
             return order
         return [fits.with_gains(order[0]), *order[1:]]
+
+    def impacts(self, data: ContactData) -> Impacts | None:
+        """Return the impacts that the test judges; None without any."""
+        return measured_impacts(data.prepared, data.world)
 
     @property
     def _without_gains(self) -> Bar:

@@ -35,7 +35,8 @@ def gains_beside_slip(base: ImpactBase, problem: ImpactProblem, fit: ImpactFit, 
     """
     seen, world = problem.impacts, problem.world
     normal = GroundPlane.of(world).normal
-    arm = (-world.bodies[0].radii[:, :1] * normal).expand(len(seen), 3)
+    reach = world.bodies[0].radii[:, :1] if seen.reach_m is None else seen.reach_m[:, None]
+    arm = (-reach * normal).expand(len(seen), 3)
     before, after = (point_velocity(twist, arm) for twist in (seen.before, seen.after))
     speed, rise = -(before @ normal), after @ normal
     slip = (before - (before @ normal)[:, None] * normal).norm(dim=-1)

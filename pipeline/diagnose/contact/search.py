@@ -1,8 +1,8 @@
 """Search for a missing effect in contact, and separation of flight equals by the contact data.
 
 The tests run in the order of what they assume: sliding segments, where the contact law hardly matters; impacts of a
-ball, which need no contact law; and last the contact segments under the model's contact law, which confirm what slides
-show. The first that selects an effect ends the search.
+ball, or of a body that falls flat on a face, which need no contact law; and last the contact segments under the model's
+contact law, which confirm what slides show. The first that selects an effect ends the search.
 
 The friction of slides is not compared with that of impacts, although a ground that attracts the body makes the former
 larger: laws of contact differ as much. Where friction acts on the whole impulse it takes mu (1 + e) v off a sliding
@@ -26,12 +26,13 @@ from ..evidence.evidence import Evidence
 from ..thresholds import THRESHOLDS
 from .contact_test import ContactData, ContactTest, selected
 from .detection_limits import DetectionLimit, detection_limits
+from .flat_impact import FlatImpactTest
 from .flight_equals import resolved_flight
 from .impact import ImpactTest
 from .segments import SegmentsTest
 from .sliding import SlidingTest
 
-TESTS: tuple[ContactTest, ...] = (SlidingTest(), ImpactTest(), SegmentsTest())
+TESTS: tuple[ContactTest, ...] = (SlidingTest(), ImpactTest(), FlatImpactTest(), SegmentsTest())
 """The contact tests in the order in which they run."""
 
 
@@ -138,5 +139,6 @@ def _limits(data: ContactData, candidates: Sequence[Candidate]) -> list[Detectio
     """Return the detection limits in sliding segments; effects that only measured impacts show are left out."""
     limits = THRESHOLDS.sliding
     unseen, scores = limits.in_impacts_alone, (limits.score, limits.score_flexible)
-    asked = [c for c in candidates if not data.earlier.get("impact") or c.effect.name not in unseen]
+    judged = data.earlier.get("impact") or data.earlier.get("flat impact")
+    asked = [c for c in candidates if not judged or c.effect.name not in unseen]
     return detection_limits(data.sliding, data.world, asked, scores, data.prepared.has_orientation, unseen)

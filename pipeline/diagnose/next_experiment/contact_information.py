@@ -1,6 +1,6 @@
 """Information about effects of contact: what data have, and what each of many motions would add, by kind of motion.
 
-In sliding and in the impacts of a ball each test compares candidates that are fitted together with the same nuisance
+In sliding and in impacts each test compares candidates that are fitted together with the same nuisance
 parameters. The information matrices of both, for all candidates at once and with the states eliminated, follow from
 one Jacobian at the values without any candidate; those of motions add up. Motions that were not made are simulated
 with the model.
@@ -27,7 +27,9 @@ from ...physics.rollout import Rollout
 from ...physics.state import State
 from ...physics.world import World
 from ...segments.candidates import Together, Variant, base_values
+from ...segments.contact_phases import is_round
 from ...segments.impacts.fit import ImpactBase
+from ...segments.impacts.flat import flat_impacts
 from ...segments.impacts.velocities import measured_impacts
 from ...segments.prepare import Prepared
 from ...segments.segment_states import fit_states
@@ -127,6 +129,7 @@ def contact_information(
     started: StartedSliding | None,
     variants: Sequence[Variant],
     motions: Sequence[HandMotion],
+    flat: Sequence[int] = (),
 ) -> tuple[list[Channel], State]:
     """Return the information of the data and of motions, by kind of motion, and the motions' first states (M).
 
@@ -136,6 +139,7 @@ def contact_information(
         started: The sliding segments of the data with the fit without candidates; None without any.
         variants: Effects that act in contact (V).
         motions: The motions (M).
+        flat: Places of the effects that flat impacts tell.
     """
     fitted = world if started is None else _with_friction(world, started)
     middle = prepared.observations.position_m[prepared.observations.seen > 0].median(0).values
@@ -143,7 +147,7 @@ def contact_information(
     made, true, share = _simulated(prepared, fitted, motions, state)
     found = [
         _sliding(prepared, fitted, started, variants, made, true, share, len(motions)),
-        _impacts(prepared, fitted, variants, made, len(motions)),
+        _impacts(prepared, fitted, variants, made, len(motions), flat),
     ]
     return [channel for channel in found if channel is not None], state
 
@@ -270,20 +274,22 @@ def _states_at(true: Rollout, segments: Segments) -> State:
 
 
 def _impacts(
-    prepared: Prepared, world: World, variants: Sequence[Variant], made: Prepared, count: int
+    prepared: Prepared, world: World, variants: Sequence[Variant], made: Prepared, count: int, flat: Sequence[int]
 ) -> Channel | None:
-    """Return the information of the impacts of a ball; None where they cannot be judged.
+    """Return the information of the impacts of a ball, or flat on a face; None where they cannot be judged.
 
-    It is divided by the scatter of the measured impacts about their law, as the test divides their misfit.
+    Flat impacts tell some effects alone. The information is divided by the scatter of the measured impacts about their
+    law, as the test divides their misfit.
     """
     if not isinstance(world.contact, ContactLaw):
         return None
-    impacts = measured_impacts(made, world)
+    measure = measured_impacts if is_round(world.bodies[world.free[0]]) else flat_impacts
+    impacts = measure(made, world) if measure is measured_impacts or flat else None
     if impacts is None:
         return None
     found, base, columns = _of_impacts(ImpactBase.of(world, impacts), variants)
     data, number, spread = np.zeros((1, *found.shape[1:])), 0, 1.0
-    known = measured_impacts(prepared, world)
+    known = measure(prepared, world)
     if known is not None:
         fitted, number = ImpactBase.of(world, known), len(known)
         data = np.zeros((1 + int(known.episode.max()), *found.shape[1:]))
@@ -291,7 +297,14 @@ def _impacts(
         degrees = np.maximum([number - 1, 5 * number - 1], 1)
         spread = max(1.0, float((fitted.fit.chi2 / degrees).max()))
     total = np.zeros((count, *found.shape[1:]))
+    if measure is flat_impacts:  # what rebounds from a flat impact turns, and is seldom flat again
+        once = np.unique(impacts.episode, return_index=True)[1]
+        impacts, found = impacts.select(once), found[once]
     np.add.at(total, impacts.episode, found)
+    if measure is flat_impacts:
+        untold = [column for k, own in enumerate(columns) if k not in flat for column in own]
+        for information in (data, total):
+            information[:, untold], information[:, :, untold] = 0.0, 0.0
     return Channel(
         name="impact",
         base=len(base),

@@ -30,6 +30,9 @@ SAME_FACE = 1 - 1e-6
 """Cosine of the angle between the normals of parts of a hull that are one face."""
 INSIDE = 1e-6
 """Distance from a face's edge, in sizes of the body, up to which a point counts as over the face."""
+FLAT_DEG = 3
+"""How flat a body has to fall on its face for the impact to tell its rebound: between rails, or from a plate that is
+pulled away."""
 _HEADINGS_DEG, _ASIDE_M = tuple(range(0, 360, 45)), (-0.25, 0.25)
 _COMPASS = ("+x", "between +x and +y", "+y", "between +y and -x", "-x", "between -x and -y", "-y", "between -y and +x")
 
@@ -58,6 +61,7 @@ class HandMotion:
         """Return the motion in words; face: name of the face that is down, empty for a ball."""
         on = f" on its face {face}" if face else ""
         towards = f"at {self.speed_m_s:.1f} m/s towards {_direction(self.heading_deg)}{self._aside}"
+        flat = f" flat on its face {face}, within {FLAT_DEG} deg," if face else ""
         spin = f"{abs(self.spin_rad_s):.0f} rad/s ({abs(self.spin_rad_s) / math.tau:.1f} turns a second)"
         return {
             "slide": f"slide it{on} {towards}",
@@ -65,7 +69,7 @@ class HandMotion:
             "push": f"throw it flat along the ground {towards}, with backspin of {spin}",
             "roll": f"roll it {towards}",
             "spin": f"spin it on the spot{on} at {spin}",
-            "drop": f"drop it{f' with its face {face} down' if face else ''} from {100 * self.height_m:.0f} cm"
+            "drop": f"drop it{flat} from {100 * self.height_m:.0f} cm"
             + (f", spinning about the horizontal at {spin}" if self.spin_rad_s else ""),
         }[self.manner]
 

@@ -113,7 +113,8 @@ def next_motions(prepared: Prepared, findings: Findings, candidates: Sequence[Ca
         return None
     motions = hand_motions(is_round(world.bodies[world.free[0]]))
     variants = variants_of(acting, world.gravity[0, :1])
-    channels, state = contact_information(prepared, world, findings.sliding, variants, motions)
+    flat = [k for k, v in enumerate(variants) if acting[v.place].effect.name in THRESHOLDS.flat_impact.told]
+    channels, state = contact_information(prepared, world, findings.sliding, variants, motions, flat)
     question = Question(
         variants=tuple(variants),
         names=tuple(acting[v.place].effect.name for v in variants),

@@ -71,13 +71,14 @@ from .contact_result import (
 from .contact_shooting import ShootingEpisodes, shoot_contact
 from .driven_joints import fit_driven_joints
 from .earlier_estimates import EarlierEstimates
+from .flight_check import flights_contradict
 from .force_fit import with_forces
 from .glides import fit_gliding_joints
 from .inertia_fit import MASS_PARTS, fit_mass_distribution
 from .joint_fit import fit_joints
 from .measured_forces import measured_forces
 from .open_loop_search import ENOUGH_EPISODES, SearchBatch, open_loop_errors, search_contact
-from .part_choice import SCALE, asked_parts, choose_parts
+from .part_choice import SCALE, asked_parts, choose_parts, without_contradicted
 
 MAX_SPAN_S = 0.8
 """Maximum duration of an episode in the fit, from its start [s]: after a dozen impacts the motion carries no
@@ -356,9 +357,14 @@ def _with_chosen_parts(
     parts = {*asked_parts(config), *(() if choice is None else choice.chosen)}
     mass: EffectEstimate | None = None
     wanted = [part for part in MASS_PARTS if part in parts]
-    if wanted:
+    while wanted:
         mass = fit_mass_distribution(world, data.episodes, start, data.noise, wanted)
-        world = mass.world
+        unasked = [part for part in wanted if part not in asked_parts(config)]
+        if not unasked or choice is None or not flights_contradict(world, mass.world, data.episodes, data.noise):
+            world = mass.world
+            break
+        choice, mass = without_contradicted(choice, unasked[-1]), None
+        wanted.remove(unasked[-1])
     if SCALE in parts and all(active.effect.name != SCALE for active in world.effects):
         scale = ActiveEffect.of(load_effect(SCALE), {}, world.gravity)
         world = replace(world, effects=(*world.effects, scale))

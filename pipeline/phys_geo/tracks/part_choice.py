@@ -95,6 +95,18 @@ def _open_parts(world: World, config: PhysConfig) -> Parts:
     return (*mass, *((SCALE,) if config.length_scale == "auto" and not present & alike else ()))
 
 
+def without_contradicted(choice: FitChoice, part: str) -> FitChoice:
+    """Return a choice without a part with which flights fit worse."""
+    chosen = tuple(one for one in choice.chosen if one != part)
+    kept = f"; the {_listed(chosen)} {'are' if _plural(chosen) else 'is'} fitted, too" if chosen else ""
+    sentence = (
+        f"By cross-validation over {choice.episodes} training tosses the {WORDS[part]} would lower the misfit about "
+        f"first contacts, but the flights, which no law of contact enters, fit worse with what these ask for, and it "
+        f"stays as before{kept}."
+    )
+    return choice.model_copy(update={"chosen": chosen, "sentence": sentence})
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Comparison:
     """Sets of parts on held-out tosses."""

@@ -24,7 +24,7 @@ class VelocityRestitution(Effect):
     parameters = (EffectParameter(name="r", unit="s/m", scale=0.1, limit=5.0, nonnegative=True),)
     phase = "contact"
     needs = ("contact",)
-    reveals = "drops of a round body from different heights, without spin"
+    reveals = "drops from different heights, without spin: of a round body, or of one that falls flat on a face"
     source = "derived: the energy that a damper whose ratio grows with the speed dissipates over a half period"
 
     def contact(self, values: Values, touch: Touch) -> Touch:

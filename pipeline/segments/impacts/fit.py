@@ -116,7 +116,10 @@ class ImpactProblem:
         turn = seen.rotation.repeat(times, 1, 1)
         normal = GroundPlane.of(world).normal
         count = len(before)
-        arm = -body.radii[:, :1] * normal - (turn @ body.com[..., None])[..., 0]
+        if seen.reach_m is None:
+            arm = -body.radii[:, :1] * normal - (turn @ body.com[..., None])[..., 0]
+        else:
+            arm = -seen.reach_m.repeat(times)[:, None] * normal
         return Impact(
             before=before,
             impulse=torch.zeros(count).to(before),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -51,9 +51,17 @@ class Impacts:
     """Covariance of `before`, shape (n, 6, 6)."""
     covariance_after: Tensor
     """Covariance of `after`, shape (n, 6, 6)."""
+    reach_m: Tensor | None = None
+    """Distance of the centre of mass from the ground of bodies that fall flat on a face, shape (n,) [m]; None for a
+    ball."""
 
     def __len__(self) -> int:
         return len(self.episode)
+
+    def select(self, places: NDArray[np.int64]) -> Impacts:
+        """Return some of the impacts (k,), by their places."""
+        own = {one.name: getattr(self, one.name) for one in fields(self)}
+        return Impacts(**{name: None if value is None else value[places] for name, value in own.items()})
 
 
 def measured_impacts(prepared: Prepared, world: World) -> Impacts | None:
@@ -73,14 +81,8 @@ def measured_impacts(prepared: Prepared, world: World) -> Impacts | None:
     if not any(len(chain) > 1 for chain in chains):
         return None
     flights = fit_states(prepared.segments("flight", world, items))
-    starts, ends, good = _ends(flights)
-    kept = [
-        (before, after)
-        for before, after in _neighbours(chains)
-        if good[before]
-        and good[after]
-        and -LIMITS.contact_s < float(starts.time_s[after]) - float(ends.time_s[before]) < LIMITS.longest_s
-    ]
+    starts, ends, good = ends_of(flights)
+    kept = impacts_between(chains, starts, ends, good)
     if not kept:
         return None
     a, b = (torch.tensor(side) for side in zip(*kept, strict=True))
@@ -93,6 +95,26 @@ def measured_impacts(prepared: Prepared, world: World) -> Impacts | None:
         covariance_before=ends.covariance[a],
         covariance_after=starts.covariance[b],
     )
+
+
+def impacts_between(
+    chains: Sequence[Sequence[Segment]], starts: Ends, ends: Ends, good: Sequence[bool]
+) -> list[tuple[int, int]]:
+    """Return the pairs of neighbouring flights with one short impact between them, both of which fit.
+
+    Args:
+        chains: Chains of flights.
+        starts: Starts of all flights.
+        ends: Their ends.
+        good: Which of them fit.
+    """
+    return [
+        (before, after)
+        for before, after in _neighbours(chains)
+        if good[before]
+        and good[after]
+        and -LIMITS.contact_s < float(starts.time_s[after]) - float(ends.time_s[before]) < LIMITS.longest_s
+    ]
 
 
 def _measurable(prepared: Prepared, world: World) -> bool:
@@ -195,7 +217,7 @@ class _Hops:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Ends:
+class Ends:
     """Ends (n) of flights on the ground, world frame."""
 
     time_s: Tensor
@@ -210,8 +232,13 @@ class _Ends:
     """Covariance of the twist, shape (n, 6, 6)."""
 
 
-def _ends(flights: Segments) -> tuple[_Ends, _Ends, list[bool]]:
-    """Return the starts and ends of flights on the ground, and which of them fit."""
+def ends_of(flights: Segments, reach_m: Tensor | None = None) -> tuple[Ends, Ends, list[bool]]:
+    """Return the starts and ends of flights on the ground, and which of them fit.
+
+    Args:
+        flights: Flights (n) with fitted states.
+        reach_m: Distance of the centre of mass from the ground at both ends, shape (n,); None for a ball's radius.
+    """
     size, count = STATE_SIZE, len(flights.items)
     rows, jacobian = flights.residuals([], torch.zeros(0).to(flights.world.gravity))
     flat = jacobian.flatten(1, 2)
@@ -225,14 +252,15 @@ def _ends(flights: Segments) -> tuple[_Ends, _Ends, list[bool]]:
     index, last = flights.observations.free[0], torch.tensor(flights.lengths).repeat(len(moves)) - 1
     found = []
     for at, towards in ((torch.zeros_like(last), 1), (last, -1)):
-        found.append(_on_ground(every, motion, index, at, towards).unflatten(0, (len(moves), count)))
+        reach = None if reach_m is None else reach_m.repeat(len(moves))
+        found.append(_on_ground(every, motion, index, at, towards, reach).unflatten(0, (len(moves), count)))
     ends = []
     for values, at in zip(found, (torch.zeros_like(last), last), strict=True):
         slopes = (values[1 : 1 + size] - values[1 + size :]) / (2 * steps[:, None, None])  # (12, n, 10)
         slopes = slopes[..., 4:].permute(1, 2, 0)
         rotation = quat_to_matrix(motion.quat_wxyz[torch.arange(count), at[:count], index])
         ends.append(
-            _Ends(
+            Ends(
                 time_s=values[0, :, 0],
                 place=values[0, :, 1:4],
                 rotation=rotation,
@@ -243,7 +271,9 @@ def _ends(flights: Segments) -> tuple[_Ends, _Ends, list[bool]]:
     return ends[0], ends[1], good
 
 
-def _on_ground(every: Segments, motion: Rollout, index: int, at: Tensor, towards: int) -> Tensor:
+def _on_ground(
+    every: Segments, motion: Rollout, index: int, at: Tensor, towards: int, reach_m: Tensor | None = None
+) -> Tensor:
     """Return time, place and twist (n, 10) where motions reach the ground before or after a frame.
 
     From the frame on (towards -1) or back (towards 1) the acceleration is that between the frame and its inner
@@ -264,10 +294,10 @@ def _on_ground(every: Segments, motion: Rollout, index: int, at: Tensor, towards
     (own, arm), (other, _) = twist(at), twist(near)
     times = seen.times_s
     rate = (other - own) / (times[item, near] - times[item, at])[:, None]
-    radius = body.radii[:, 0]
-    center = motion.position_m[item, at, index]
+    radius = body.radii[:, 0] if reach_m is None else reach_m
+    center = motion.position_m[item, at, index] + (0.0 if reach_m is None else arm)
     gap = center @ normal - offset[0] - radius
-    moving = own[:, :3] - torch.linalg.cross(own[:, 3:], arm)
+    moving = own[:, :3] if reach_m is not None else own[:, :3] - torch.linalg.cross(own[:, 3:], arm)
     speed, gain = moving @ normal, rate[:, :3] @ normal
     # the root of gap + speed t + gain t^2 / 2 with the body falling at the end, rising at the start
     root = (speed.square() - 2 * gain * gap).clamp_min(0.0).sqrt()
