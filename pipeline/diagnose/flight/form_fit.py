@@ -67,7 +67,7 @@ class FormFit:
     """Places of the numbers of each form."""
     more: list[list[list[int]]]
     """Places of the numbers of each further effect, at each combination of its constants."""
-    others: list[list[int]]
+    others: dict[str, list[int]]
     """Places of the numbers of each other effect of the world that has a value for all episodes."""
     values: Array
     """Values of the other parameters, shape (n,)."""
@@ -133,7 +133,7 @@ class FormFit:
             rest=rest,
             forms=_forms(ends, [] if active.effect.has("wrench") else own),
             more=list(further.values()),
-            others=list(others.values()),
+            others=others,
             values=_placed(range(count), values.tolist(), last),
             nonnegative=frozenset(k for k, p in enumerate(parameters) if k >= count and p.bounds[0] == 0.0),
             count=max(float(flight.dof.sum()), 2.0),

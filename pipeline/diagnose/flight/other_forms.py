@@ -70,6 +70,8 @@ class OtherForms:
     """Twice the logarithm of the odds of all forms against the effect's own law."""
     then: str
     """What to record next to tell that form from the effect."""
+    instead: frozenset[str] = frozenset()
+    """Other named effects that flights do not ask for beside that form."""
 
     @property
     def likelier(self) -> bool:
@@ -175,7 +177,18 @@ def _compared(
     together = [log_mean([half[words] for words in family.forms]) for family in families]
     odds = 2 * (log_mean(together, weights_of(families, name)) + math.log(forces))
     then = next(family.then for family in families if best in family.forms)
-    return OtherForms(effect=name, words=best, gain=2 * half[best], odds=odds, then=then)
+    instead = _not_needed(fit, fit.forms[laws + forms.index(best)], dispersion, likeliest.scatter)
+    return OtherForms(effect=name, words=best, gain=2 * half[best], odds=odds, then=then, instead=instead)
+
+
+def _not_needed(fit: FormFit, form: Sequence[int], dispersion: float, scatter: float) -> frozenset[str]:
+    """Return the other effects of the world without which a form explains the flights as well, by BIC."""
+    beside = fit.in_its_stead(form, dispersion).chi2
+    return frozenset(
+        name
+        for name, own in fit.others.items()
+        if (fit.in_its_stead(form, dispersion, (), own).chi2 - beside) / scatter < len(own) * math.log(fit.count)
+    )
 
 
 Tried = list[list[list[tuple[FormCost, int]]]]
@@ -191,7 +204,7 @@ def _tried(fit: FormFit, form: Sequence[int], dispersion: float) -> Tried:
             [[(fit.in_its_stead(form, dispersion, one), more + len(one)) for one in variants] for variants in fit.more]
         )
     if fit.others:
-        found.append([[(fit.in_its_stead(form, dispersion, (), one), more - len(one))] for one in fit.others])
+        found.append([[(fit.in_its_stead(form, dispersion, (), one), more - len(one))] for one in fit.others.values()])
     return found
 
 

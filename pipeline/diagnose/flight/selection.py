@@ -221,6 +221,8 @@ def judged(
     )
     fleeting = frozenset(without_lasting(found.flight, found.world, found.names, scatter))
     wrong = {one.effect for one in others if one.likelier} | fleeting
+    # what is known to be another law may also do what a further effect was found for
+    wrong |= {name for one in others if one.odds > LIMITS.other_law for name in one.instead} & set(found.names)
     withheld: frozenset[str] = frozenset()
     if wrong and set(found.names) - wrong and not _is_mostly_other(found, others):
         if _most_evident(found) in wrong or any(_carrying(found, name) for name in wrong):
