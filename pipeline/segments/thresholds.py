@@ -280,20 +280,13 @@ class ChoiceThresholds:
     )
     least_episodes: int = threshold(8, "episodes", "fewest tosses with measured rotation", BY_ARGUMENT)
     looked_at: int = threshold(16, "episodes", "most of which flights are compared", BY_ARGUMENT)
-    worse_t: float = threshold(
-        2.0,
-        "standard errors",
-        "a mass distribution that was chosen is not taken over where flights fit worse with it by so much, in the mean "
-        "over episodes, and",
-        BY_ARGUMENT,
-        "boxes and balls with nothing wrong in their mass: see `worse_chi2`",
-    )
     worse_chi2: float = threshold(
         25.0,
         "chi2",
-        "by so much together, in units of chi2 / dof: five standard errors",
+        "a mass distribution that was chosen is not taken over where flights of most episodes fit worse with it, and "
+        "of all but the worst by more than this together, in units of chi2 / dof: five standard errors",
         BY_ARGUMENT,
-        "a box in MuJoCo and a bouncing ball whose moments first contacts had changed by 30 and 3 %: 158,000 and 6,100",
+        "a box in MuJoCo and a bouncing ball, whose moments first contacts had changed by 30 and 3 %: 158,000, 6,100",
     )
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...geometry.hull_faces import hull_faces
-from ...geometry.rotation import quat_to_matrix
+from ...geometry.rotation import quat_exp, quat_to_matrix
 from ...physics.body import Body
 from ...physics.world import World
 from ...trajectories.segmentation import GroundPlane, Segment, heights_of
@@ -61,7 +61,9 @@ def flat_impacts(prepared: Prepared, world: World) -> Impacts | None:
     reach_m = torch.tensor(reach).to(world.gravity)
     starts, ends, good = ends_of(flights, reach_m)
     normal = GroundPlane.of(world).normal
-    speeds = [_speeds(world, body, end, normals) for end in (ends, starts)]
+    times, last = flights.observations.times_s, torch.tensor(flights.lengths) - 1
+    frames = times[torch.arange(len(items)), last], times[:, 0]
+    speeds = [_speeds(world, body, end, at, normals) for end, at in zip((ends, starts), frames, strict=True)]
     kept = [
         (before, after)
         for before, after in impacts_between(chains, starts, ends, good)
@@ -139,17 +141,26 @@ def _clear_frames(clear: NDArray[np.bool_], first: int) -> list[int]:
     return list(itertools.takewhile(lambda k: clear[k], begun))[:-1]
 
 
-def _speeds(world: World, body: Body, ends: Ends, normals: Array) -> tuple[Tensor, Tensor]:
-    """Return the speeds (n,) with the energy along the normal and of tipping, and whether ends of flights are flat."""
+def _speeds(world: World, body: Body, ends: Ends, frame_s: Tensor, normals: Array) -> tuple[Tensor, Tensor]:
+    """Return the speeds (n,) with the energy along the normal and of tipping, and whether ends of flights are flat.
+
+    Args:
+        world: The world.
+        body: The body.
+        ends: Starts or ends of flights (n) on the ground, with the rotations of the frames next to it.
+        frame_s: Times of these frames [s], shape (n,).
+        normals: Outward normals (F, 3) of the body's faces.
+    """
     normal = GroundPlane.of(world).normal
     velocity, omega = ends.twist[:, :3], ends.twist[:, 3:]
     tipping = omega - (omega @ normal)[:, None] * normal
-    inertia = ends.rotation @ body.inertia[0] @ ends.rotation.mT
+    rotation = quat_to_matrix(quat_exp(omega * (ends.time_s - frame_s)[:, None])) @ ends.rotation
+    inertia = rotation @ body.inertia[0] @ rotation.mT
     turning = torch.einsum("ni,nij,nj->n", tipping, inertia, tipping) / body.mass[0]
     along = velocity @ normal
     square = along.square() + turning
     level = velocity - along[:, None] * normal
-    towards = -(ends.rotation.mT @ normal) @ torch.as_tensor(normals).to(normal).T
+    towards = -(rotation.mT @ normal) @ torch.as_tensor(normals).to(normal).T
     flat = towards.amax(-1) > math.cos(LIMITS.tilt_rad)
     upright = (turning < LIMITS.turning_share * square) & (level.norm(dim=-1) < LIMITS.slip_share * along.abs())
     return square.sqrt(), flat & upright

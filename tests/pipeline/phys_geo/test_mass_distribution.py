@@ -13,8 +13,9 @@ from cgwm.datasets.capture.tracks import Episode, tracks_csv
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_result import FitRecord
+from cgwm.pipeline.phys_geo.tracks.flight_check import flights_contradict, rises
 from cgwm.pipeline.phys_geo.tracks.inertia_fit import fit_mass_distribution
-from cgwm.pipeline.phys_geo.tracks.part_choice import choose_parts
+from cgwm.pipeline.phys_geo.tracks.part_choice import choose_parts, without_contradicted
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
@@ -25,6 +26,7 @@ from cgwm.schemas import (
     Body,
     BoxShape,
     CaptureManifest,
+    FitChoice,
     Ground,
     InputDataError,
     PhysConfig,
@@ -32,6 +34,7 @@ from cgwm.schemas import (
     UsageError,
     World,
 )
+from helpers import diagnosis_data
 from helpers.worlds import batch, box_body, law, state_of, times, world_of
 from scipy.spatial.transform import Rotation
 
@@ -237,3 +240,33 @@ def test_images_do_not_show_where_the_mass_is(capture: Path, tmp_path: Path) -> 
 
 def _diagonal(world) -> np.ndarray:
     return world.bodies[0].inertia[0].diagonal().numpy()
+
+
+def test_moments_that_flights_contradict_are_not_taken_over() -> None:
+    box = world_of(box_body(), contact=law(), step_s=STEP_S)
+    wrong = apply_parameters(box, mass_distribution("box", 0.07)[3:], batch((1.0, 1.0, 1.3)))
+    flying = [Episode(*one) for one in diagnosis_data.tosses(box, 1, count=6, duration_s=0.4, height_m=(1.0, 1.2))]
+    assert flights_contradict(box, wrong, flying, NOISE)
+    assert not flights_contradict(box, box, flying, NOISE)
+
+
+@pytest.mark.parametrize(
+    ("changes", "contradicted"),
+    [
+        ([900.0, 20.0, 25.0, -1.0], True),
+        ([200.0, -5.0, -8.0, -9.0], False),
+        ([9.0, 8.0], False),
+        ([50.0], False),
+        ([], False),
+    ],
+)
+def test_a_rise_of_chi2_counts_where_most_episodes_show_it(changes: list[float], contradicted: bool) -> None:
+    assert rises(changes, 1.0) == contradicted
+
+
+def test_a_part_that_is_contradicted_is_said_not_to_be_fitted() -> None:
+    choice = FitChoice(episodes=8, chosen=("centre_of_mass", "second_moments"), tested=(), sentence="")
+    left = without_contradicted(choice, "second_moments")
+    assert left.chosen == ("centre_of_mass",)
+    assert "flights" in left.sentence and left.sentence.endswith("; the centre of mass is fitted, too.")
+    assert without_contradicted(left, "centre_of_mass").sentence.endswith("as before.")
