@@ -46,6 +46,7 @@ TABLE = {f"{group}.{one.name}": one for group, some in thresholds_page.groups().
 """Thresholds of a diagnosis, by group.field."""
 NUMERICS = {
     "contact/friction_pyramid.FLATTEST": "keeps an ellipse from degenerating",
+    "flight/group_values.ZERO": "rounding of a value at its bound",
     "flight/form_fit.LEAST_SHARE": "keeps a matrix solvable",
     "flight/form_fit.SINGULAR": "keeps a matrix solvable",
     "evidence/evidence.NEARLY": "rounding of a value at its bound",
@@ -76,6 +77,7 @@ NUMERICS = {
     "evidence/robust_fit.ITERATIONS": "end of a descent",
     "evidence/robust_fit.MOST_NUMBERS": "size of a batch",
     "evidence/robust_fit.STEPS": "lengths of a step that are tried",
+    "next_experiment/hand_motions.FLAT_DEG": "what the words of a proposed motion ask for",
     "next_experiment/hand_motions.INSIDE": "tolerance of a geometric test",
     "next_experiment/hand_motions.MOST_AHEAD_M": "where a proposed motion begins",
     "next_experiment/hand_motions.SAME_FACE": "tolerance of a geometric test",
@@ -87,6 +89,7 @@ NUMERICS = {
 """Numbers of modules in `pipeline/diagnose` outside of the table, each with the reason why it decides no verdict."""
 SEGMENT_NUMERICS = {
     "length of a warning": ("prepare.NAMED",),
+    "keeps a covariance solvable where nothing is used": ("impacts/flat.KNOWN_M_S",),
     "end of a descent": (
         "first_contact_fit.ITERATIONS, TOLERANCE",
         "impacts/fit.ITERATIONS, FALL",

@@ -52,6 +52,7 @@ from ...runtime.resources import one_torch_thread
 from ...segments.center_of_mass import as_one_body
 from ...segments.first_contact_fit import EffectEstimate
 from ...segments.fitted_parameters import bound_warnings
+from ...segments.flight_check import flights_contradict
 from ...segments.impacts.restitution import RestitutionFit, restitution_of
 from ...segments.segments import world_for
 from ...trajectories.initial_state import estimate_states, flight_frames, warmup_frames
@@ -71,7 +72,6 @@ from .contact_result import (
 from .contact_shooting import ShootingEpisodes, shoot_contact
 from .driven_joints import fit_driven_joints
 from .earlier_estimates import EarlierEstimates
-from .flight_check import flights_contradict
 from .force_fit import with_forces
 from .glides import fit_gliding_joints
 from .inertia_fit import MASS_PARTS, fit_mass_distribution

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -60,8 +60,8 @@ class Impacts:
 
     def select(self, places: NDArray[np.int64]) -> Impacts:
         """Return some of the impacts (k,), by their places."""
-        own = {one.name: getattr(self, one.name) for one in fields(self)}
-        return Impacts(**{name: None if value is None else value[places] for name, value in own.items()})
+        own = {one.name: value[places] for one in fields(self) if (value := getattr(self, one.name)) is not None}
+        return replace(self, **own)
 
 
 def measured_impacts(prepared: Prepared, world: World) -> Impacts | None:

@@ -13,12 +13,12 @@ from cgwm.datasets.capture.tracks import Episode, tracks_csv
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_result import FitRecord
-from cgwm.pipeline.phys_geo.tracks.flight_check import flights_contradict, rises
 from cgwm.pipeline.phys_geo.tracks.inertia_fit import fit_mass_distribution
 from cgwm.pipeline.phys_geo.tracks.part_choice import choose_parts, without_contradicted
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
+from cgwm.pipeline.segments.flight_check import flights_contradict, rises
 from cgwm.pipeline.segments.held_out_gain import FOLDS, ContactLinearization
 from cgwm.pipeline.synthesize.parameters import draw_parameters
 from cgwm.pipeline.trajectories.track_noise import Noise

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ....datasets.capture.tracks import Episode
-from ...physics.world import World
-from ...segments.prepare import prepare
-from ...segments.segment_states import fit_states
-from ...segments.segments import Segments
-from ...segments.thresholds import SEGMENT_THRESHOLDS
-from ...trajectories.track_noise import Noise
+from ...datasets.capture.tracks import Episode
+from ..physics.world import World
+from ..trajectories.track_noise import Noise
+from .prepare import prepare
+from .segment_states import fit_states
+from .segments import Segments
+from .thresholds import SEGMENT_THRESHOLDS
 
 LIMITS = SEGMENT_THRESHOLDS.choice
 
