@@ -8,10 +8,10 @@
 Each case begins as six mixed tosses of a cube or a ball with one large effect of contact, or none, made by an engine
 that is not cgwm's. It is fitted and diagnosed as a user would do it. Where the diagnosis asks for motions (at most
 three a round), these are made in the same engine with the same hidden effect, with the scatter of a hand (10 % of each
-speed and height, 10 degrees of direction, 2 cm of place), measured with the same noise and added to the training
-split; at most twice. Captures and diagnoses are kept round by round under out/sequence/, so that one machine can make
-what another one asked for: `run` does what it can, and leaves a case alone whose engine is not installed. Thresholds
-may be chosen on the stage development alone, whose seeds are even.
+speed and height, 10 degrees of direction, 2 degrees where a drop flat on a face is asked for, 2 cm of place), measured
+with the same noise and added to the training split; at most twice. Captures and diagnoses are kept round by round under
+out/sequence/, so that one machine can make what another one asked for: `run` does what it can, and leaves a case alone
+whose engine is not installed. Thresholds may be chosen on the stage development alone, whose seeds are even.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ Stage = Literal[
     "report8",
     "report9",
     "report10",
+    "report11",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Each report stage is read once, after everything is fixed; the next run takes the next one."""

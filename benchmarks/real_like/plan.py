@@ -33,6 +33,7 @@ Stage = Literal[
     "report15",
     "report16",
     "report17",
+    "report18",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on `development` alone. Each report stage is read once, after everything is fixed: the first
