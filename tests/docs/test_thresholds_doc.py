@@ -107,6 +107,7 @@ SEGMENT_NUMERICS = {
         "sliding/residuals.SWEEPS",
         "sliding/variant_fits.FIRST_ITERATIONS",
         "sliding/variant_fits.MOST_PASSES",
+        "sliding/variant_fits.STALLED",
         "flights/variance_components.STEPS",
         "flights/variance_components.LONGEST, ENOUGH",
         "flights/variance_components.LEAST_INFORMATION",

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
+from ...physics.state import State
 from ..candidates import Variant
 from ..segments import Segments
 from ..thresholds import SEGMENT_THRESHOLDS
@@ -18,6 +20,8 @@ FIRST_ITERATIONS = 3
 MOST_PASSES = 5
 """Maximum number of continuations of the fits that are close. A slide that ends within a segment allows small steps
 only, and a fit that has not converged would lose against one that needs fewer."""
+STALLED = 30.0
+"""How many times as large as in the best fit of all the chi2 of a segment is that stalled."""
 MANY = 4
 """Maximum number of parameters of a candidate that is fitted in a batch with smaller ones. The longest fit determines
 the time of a batch."""
@@ -49,7 +53,28 @@ def fits_of_variants(
         found |= again
         fell = [k for k in close if close[k][1].cost - again[k][1].cost > converged]
         close = {k: again[k] for k in fell if len(again[k][0].parameters) <= MANY}
-    return list(found.values())
+    return _unstuck(list(found.values()), started)
+
+
+def _unstuck(found: list[tuple[Variant, SlidingFit]], started: StartedSliding) -> list[tuple[Variant, SlidingFit]]:
+    """Return fits, those continued from the best states of all whose cost is mostly that of segments that stalled.
+
+    The state of one segment at a wrong minimum would decide against an effect that explains all others.
+    """
+    chi2 = torch.stack([fit.chi2 for _, fit in found])
+    best, owner = chi2.min(0)
+    count, every = chi2.shape[1], State.joined(*(fit.segments.observations.state for _, fit in found))
+    place, done = torch.arange(count), list(found)
+    for k, (variant, fit) in enumerate(found):
+        stuck = fit.chi2 > STALLED * best
+        if float((fit.chi2 - best)[stuck].sum()) < 0.5 * fit.cost:
+            continue
+        states = every.at(torch.where(stuck, owner, k) * count + place)
+        start = fit.segments.with_state(states), fit.values[0]
+        again = fit_sliding(started.segments.world, [variant], [start], started.flight_parameters, ITERATIONS)[0]
+        if again.cost < fit.cost:
+            done[k] = variant, again
+    return done
 
 
 def _starts(part: Sequence[Variant], started: StartedSliding) -> list[tuple[Segments, Tensor]]:

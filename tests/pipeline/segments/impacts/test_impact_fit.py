@@ -139,7 +139,7 @@ def test_an_impact_of_weight_two_counts_as_two_and_one_of_weight_zero_as_none() 
     every, twice, without = fits_to_weighted(problem, start, weights, start)
 
     def chosen(rows: list[int]) -> ImpactProblem:
-        fields = {name: getattr(seen, name)[rows] for name in vars(seen)}
+        fields = {name: None if value is None else value[rows] for name, value in vars(seen).items()}
         assert problem.whitening is not None
         return replace(problem, impacts=Impacts(**fields), whitening=problem.whitening[rows])
 
