@@ -118,10 +118,21 @@ class Checkpoint:
         return time.monotonic() - self._last >= self._every_s
 
     def write(self, name: str, state: State) -> None:
-        """Write a state atomically."""
-        if not (self.path / _KEY).is_file():
+        """Write a state atomically.
+
+        Raises:
+            UsageError: If another process, which began at the same time, writes these checkpoints.
+        """
+        fresh = not (self.path / _KEY).is_file()
+        if fresh:
+            self._lock.release()  # of a directory that was removed
             self.path.mkdir(parents=True, exist_ok=True)
-            self._lock.hold()
+        if not self._lock.hold():
+            raise UsageError(
+                f"{self.path}: another process is writing there now.",
+                todo="wait until it has ended, or choose another --out.",
+            )
+        if fresh:
             with replaced_file(self.path / _KEY) as path:
                 path.write_text(json.dumps(self._made_of, indent=1) + "\n", encoding="utf-8")
         with replaced_file(self.path / _file_name(name)) as path:

@@ -134,6 +134,9 @@ def test_what_another_process_is_writing_is_not_taken_for_interrupted(tmp_path):
     for one in (mine, ladder):
         one._lock.release()  # as of a process that was killed
         with held_by_another(one.path / LOCK_NAME):
+            if one is mine:
+                with pytest.raises(UsageError, match="another process is writing there"):
+                    mine.write("background", {"k": 2})  # both began before either wrote
             for resume in (True, False):
                 with pytest.raises(UsageError, match=r"another process is writing (a run|the ladder) of"):
                     if one is mine:
