@@ -23,9 +23,9 @@ from .solvers import Solver
 
 SENT = 512
 """Commands that are kept, from which late states are predicted forward."""
-FARTHEST = 10.0
-"""Largest distance of a joint from the middle of its limits, in units of half of their range: beyond it the position is
-in other units, degrees or millimetres."""
+FARTHEST, LEAST_HALF = 10.0, 0.1
+"""Largest distance of a joint from the middle of its limits, in units of half of their range, and the least such half
+[rad or m], for joints that a task holds still: beyond it the position is in other units, degrees or millimetres."""
 UNIT_TOLERANCE = 0.01
 """Largest deviation of a measured quaternion's length from 1."""
 
@@ -296,7 +296,8 @@ class PlanningController(ABC):
             return f"its time, {state.time_s:.6g} s, is not later than {self._last_s:.6g} s"
         for name in self.joints:
             low, high, _ = self.limits(name)
-            if abs(state.joints[name] - 0.5 * (low + high)) > FARTHEST * 0.5 * (high - low):
+            half = max(0.5 * (high - low), LEAST_HALF)
+            if abs(state.joints[name] - 0.5 * (low + high)) > FARTHEST * half:
                 return f"joint '{name}' is at {state.joints[name]:g}, far from its limits, {low:g} to {high:g}"
         return ""
 
