@@ -15,6 +15,7 @@ from ..physics.fused.packing import reason_against
 from ..physics.parameters import Parameter
 from ..physics.world import World
 from .candidates import Together, Variant, acts_in, base_parameters, base_values, with_variants
+from .impulse_errors import ImpulseErrors, estimated_errors, impacts_of, projected_with
 from .segment_fit import Linear, projected
 from .segments import Segments
 
@@ -83,6 +84,48 @@ def linearize(
         raise ValueError("no candidate acts in these segments")
     linear = projected(segments, rows, jacobian, len(parameters))
     return _linearization(linear, segments, parameters, len(base_parameters(world, segments.kind)), groups, robust)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContactLinearization:
+    """Contact segments linearised beside the errors of their impulses."""
+
+    linear: Linearization
+    """The linearization without what these errors can follow."""
+    plain: Linearization
+    """The linearization under the contact law alone."""
+    errors: ImpulseErrors
+    """The errors."""
+    price: Array
+    """Price (B,) of the errors in each segment, to be compared with that of other errors (`projected_with`)."""
+
+
+def linearize_contact(
+    segments: Segments,
+    world: World,
+    variants: Sequence[Variant],
+    groups: Sequence[int],
+    errors: ImpulseErrors | None = None,
+) -> ContactLinearization:
+    """Return the linearization of fitted contact segments; those that fit badly get less weight.
+
+    Args:
+        segments: With fitted states.
+        world: The model's world.
+        variants: The candidates.
+        groups: Session of each episode.
+        errors: Errors of the impulses; estimated from the segments by default.
+    """
+    parameters, rows, jacobian = derivatives(segments, world, variants)
+    impacts, count, base = impacts_of(segments.in_world(world)), len(parameters), len(base_parameters(world, "contact"))
+    if errors is None:
+        errors = estimated_errors(segments, rows, jacobian[..., count:], impacts)
+    beside, price = projected_with(segments, rows, jacobian, impacts, errors, count)
+    linear, plain = (
+        _linearization(one, segments, parameters, base, groups, robust=True)
+        for one in (beside, projected(segments, rows, jacobian, count))
+    )
+    return ContactLinearization(linear=linear, plain=plain, errors=errors, price=price.numpy())
 
 
 def derivatives(

@@ -27,7 +27,8 @@ from ...physics.parameters import Parameter, apply_parameters
 from ...physics.state import State
 from ...physics.world import World
 from ...segments.candidates import base_parameters, base_values, with_added
-from ...segments.linearization import Linearization, linearize
+from ...segments.impulse_errors import ImpulseErrors
+from ...segments.linearization import Linearization, linearize_contact
 from ...segments.segment_fit import robust_excess
 from ...segments.segment_states import costs_of, fit_states
 from ...segments.segments import Segments
@@ -63,6 +64,10 @@ class CandidateFit:
     its own projected out."""
     columns: tuple[int, ...]
     """Columns of the candidate's parameters in the linearization; empty without one."""
+    errors: ImpulseErrors
+    """Errors of the impulses."""
+    price: Array
+    """Price (B,) of these in each segment."""
 
     @property
     def start(self) -> Array:
@@ -94,10 +99,10 @@ def candidate_fits(
         place = _place(none.segments, world, one)
         tried[one.name] = [place.at(values) for values in _starts(one, place)]
     states = [one.segments.observations.state for some in tried.values() for one in some]
-    fits = {}
+    fits: dict[str, CandidateFit] = {}
     for name, some in tried.items():
         shared = [one.at(one.values, search=False, also=states) for one in some]
-        fits[name] = min(shared, key=lambda one: one.cost).linearised(groups)
+        fits[name] = min(shared, key=lambda one: one.cost).linearised(groups, fits.get(""))
     return fits.pop(""), fits
 
 
@@ -124,11 +129,14 @@ class _Place:
         fitted = fit_states(self.segments, self.parameters, values, count, search=search, also=also)
         return replace(self, values=values, segments=fitted)
 
-    def linearised(self, groups: Sequence[int]) -> CandidateFit:
+    def linearised(self, groups: Sequence[int], none: CandidateFit | None) -> CandidateFit:
         """Return the segments linearised here, in parameters measured from the model's world."""
         columns = torch.stack([p.decode(self.values[k]) for k, p in enumerate(self.parameters)])[None]
         world = apply_parameters(self.world, self.parameters, columns)
-        linear = linearize(self.segments.in_world(world), world, (), groups, robust=True)
+        at = linearize_contact(self.segments.in_world(world), world, (), groups)
+        linear = at.linear
+        if none is not None:
+            linear = replace(linear, chi2=linear.chi2 + at.price - none.price)
         names = {p.name for p in self.own}
         own = tuple(k for k, p in enumerate(linear.parameters) if p.name in names)
         # the effect comes last, and deviations of its own would explain it away
@@ -145,6 +153,8 @@ class _Place:
             values=self.values,
             linear=replace(linear, parameters=tuple(wide), prior=prior),
             columns=own,
+            errors=at.errors,
+            price=at.price,
         )
         return replace(fit, linear=measured_from(fit.linear, fit.start))
 

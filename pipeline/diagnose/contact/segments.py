@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ...physics.world import World
 from ...segments.candidates import Candidate, Variant, base_parameters, base_values, with_added
-from ...segments.linearization import Linearization, linearize
+from ...segments.linearization import Linearization, linearize_contact
 from ...segments.segment_fit import refit
 from ...segments.segment_states import fit_states
 from ...segments.segments import Segments
@@ -69,25 +69,34 @@ class SegmentsTest(ContactTest):
         variants = [v for v in data.variants(candidates, ("contact", "flight")) if _acts_near_ground(v)]
         if data.segments is None or not variants:
             return []
-        first = _ranked(_linear_tests(data, data.segments, candidates, variants), data)
+        at = linearize_contact(data.segments, data.world, variants, data.prepared.groups)
+        first = _ranked(_linear_tests(at.linear, candidates, variants), data)
+        # an effect that impacts show widens their errors until it is in the model
+        under_law = {one.name: one.score for one in _ranked(_linear_tests(at.plain, candidates, variants), data)}
+        likely = {one.name: max(one.score, under_law[one.name]) for one in first}
+        first = [replace(one, first_score=likely[one.name]) for one in first]
         if not any(self._is_likely(one) for one in first) or not any(self._can_be_named(one, data) for one in first):
             return first
         fitted = [one for one in first if _can_be_fitted(one)]
         none, fits = candidate_fits(data.segments, data.world, fitted, data.prepared.groups)
-        tests = _linear_tests(data, none.segments.in_world(data.world), candidates, variants)
+        at = linearize_contact(
+            none.segments.in_world(data.world), data.world, variants, data.prepared.groups, none.errors
+        )
+        tests = _linear_tests(at.linear, candidates, variants)
         tries = {candidates[place].effect.name: count for place, count in tries_of(variants).items()}
         at_fits = [tests[0].beside(one, fits[one.name], tries[one.name]) for one in fitted]
-        scores = {one.name: one.score for one in first}
-        return [replace(one, first_score=scores[one.name]) for one in _ranked([*tests, *at_fits], data)]
+        return [replace(one, first_score=likely[one.name]) for one in _ranked([*tests, *at_fits], data)]
 
     def _is_likely(self, one: Evidence) -> bool:
         """Return whether a nameable effect of one parameter has a score where it is absent; then effects are fitted."""
         single = len(one.candidate.effect.parameters) <= self.limits.few_parameters
-        return single and one.name in dict(self.limits.alone) and one.score > self.limits.first_score
+        return single and one.name in dict(self.limits.alone) and one.first_score > self.limits.first_score
 
     def _can_be_named(self, one: Evidence, data: ContactData) -> bool:
         """Return whether an effect with a score where it is absent could pass a bar, whatever its fit explains."""
-        return one.score > self.limits.first_score and (self._is_shown(one, data) or self._stands_alone(one, data))
+        return one.first_score > self.limits.first_score and (
+            self._is_shown(one, data) or self._stands_alone(one, data)
+        )
 
     def _is_shown(self, one: Evidence, data: ContactData) -> bool:
         """Return whether slides show an effect, too, so that a small score confirms it."""
@@ -189,11 +198,9 @@ class _Test:
         return replace(self.evidence, gains=tuple(gains.tolist()), score=score, repetition=repeated)
 
 
-def _linear_tests(
-    data: ContactData, segments: Segments, candidates: Sequence[Candidate], variants: Sequence[Variant]
-) -> list[_Test]:
+def _linear_tests(linear: Linearization, candidates: Sequence[Candidate], variants: Sequence[Variant]) -> list[_Test]:
     """Return the tests of all variants in segments linearised without any of them."""
-    linear = with_segment_parameters(linearize(segments, data.world, variants, data.prepared.groups, robust=True))
+    linear = with_segment_parameters(linear)
     base = list(range(linear.base))
     without, lost, tries = robust_fit(linear, base), losses_by_others(linear, [base])[0], tries_of(variants)
     penalty, tests = _penalty(linear), []
