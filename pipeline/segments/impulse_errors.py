@@ -125,11 +125,14 @@ def _changes(
     world, record = segments.world, rollout.contacts
     assert record is not None and world.ground_normal is not None
     body, normal = world.bodies[0], world.ground_normal
-    quat, position = rollout.quat_wxyz[item, frame, 0], rollout.position_m[item, frame, 0]
+    quat = rollout.quat_wxyz[item, frame, 0]
     pressed = (record.impulse_n_s * record.normal).sum(-1)[item, frame]
-    point = (record.position_m[item, frame] * pressed[..., None]).sum(1) / pressed.sum(1, keepdim=True)
-    offset = quat_rotate(quat, body.com.expand(len(item), 3))
-    arm = point - position - offset
+    centers, radii = body.plane_spheres
+    # points of the body, as it has moved on since they touched
+    point = (centers[0] * pressed[..., None]).sum(1) / pressed.sum(1, keepdim=True)
+    radius = (radii[0] * pressed).sum(1, keepdim=True) / pressed.sum(1, keepdim=True)
+    offset = quat_rotate(quat, body.com[0].expand_as(point))
+    arm = quat_rotate(quat, point) - offset - radius * normal
     total = record.impulse_n_s[item, frame].sum(1)
     tangent = total - (total @ normal)[:, None] * normal
     other = torch.linalg.cross(normal, normal.roll(1)).expand_as(tangent)
