@@ -88,7 +88,7 @@ def _synthetic(count: int, seed: int, factor: Any = None) -> tuple[Any, torch.Te
     rows = rng.standard_normal((count, 10, 6)) + np.einsum("btck,bk->btc", columns, drawn)
     segments = SimpleNamespace(dof=torch.full((count,), 60.0 - STATE_SIZE))
     frames = torch.tensor([[2, 5]]).expand(count, 2)
-    return segments, *map(torch.as_tensor, (rows, states)), Impacts(frames, torch.as_tensor(columns))
+    return segments, torch.as_tensor(rows), torch.as_tensor(states), Impacts(frames, torch.as_tensor(columns))
 
 
 def test_the_errors_are_those_that_the_impulses_have() -> None:
