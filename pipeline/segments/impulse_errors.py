@@ -218,11 +218,8 @@ def estimated_errors(segments: Segments, rows: Tensor, states: Tensor, impacts: 
 
 def projected_with(
     segments: Segments, rows: Tensor, jacobian: Tensor, impacts: Impacts, errors: ImpulseErrors, count: int
-) -> tuple[Linear, Tensor]:
+) -> Linear:
     """Return the linearization of segments without what their states and errors of their impulses can follow.
-
-    Beside it the price (B,) of these errors: twice the negative logarithm of their likelihood beside chi2. Errors that
-    follow anything have a small chi2 and a high price.
 
     Args:
         segments: The segments.
@@ -236,14 +233,9 @@ def projected_with(
     equations = _normal_equations(rows, torch.cat((jacobian, columns), -1), count, columns.shape[-1])
     found = equations.eliminated()
     taken = (equations.state_slope * found.state_step).sum(1)
-    linear = Linear(
+    return Linear(
         information=found.information, score=found.score, chi2=rows.square().sum((1, 2)) - taken, dof=segments.dof
     )
-    size = jacobian.shape[-1] - count
-    price = torch.logdet(equations.states) - torch.logdet(equations.states[:, :size, :size])
-    weight = errors.factor.gather(1, impacts.frame.clamp_min(0)) ** -2
-    rare = FREEDOM * (weight - 1) - (FREEDOM - 2) * weight.log()
-    return linear, price + (rare * (impacts.frame >= 0)).sum(1)
 
 
 def _normal_equations(rows: Tensor, jacobian: Tensor, count: int, known: int = 0) -> NormalEquations:

@@ -90,14 +90,12 @@ def linearize(
 class ContactLinearization:
     """Contact segments linearised beside the errors of their impulses."""
 
-    linear: Linearization
-    """The linearization without what these errors can follow."""
     plain: Linearization
     """The linearization under the contact law alone."""
+    beside: Linearization
+    """The linearization without what errors of impulses can follow."""
     errors: ImpulseErrors
     """The errors."""
-    price: Array
-    """Price (B,) of the errors in each segment, to be compared with that of other errors (`projected_with`)."""
 
 
 def linearize_contact(
@@ -120,12 +118,14 @@ def linearize_contact(
     impacts, count, base = impacts_of(segments.in_world(world)), len(parameters), len(base_parameters(world, "contact"))
     if errors is None:
         errors = estimated_errors(segments, rows, jacobian[..., count:], impacts)
-    beside, price = projected_with(segments, rows, jacobian, impacts, errors, count)
-    linear, plain = (
+    plain, beside = (
         _linearization(one, segments, parameters, base, groups, robust=True)
-        for one in (beside, projected(segments, rows, jacobian, count))
+        for one in (
+            projected(segments, rows, jacobian, count),
+            projected_with(segments, rows, jacobian, impacts, errors, count),
+        )
     )
-    return ContactLinearization(linear=linear, plain=plain, errors=errors, price=price.numpy())
+    return ContactLinearization(plain=plain, beside=beside, errors=errors)
 
 
 def derivatives(

@@ -59,26 +59,26 @@ class CandidateFit:
     """Their values in the model's world (k,), in fitted coordinates."""
     values: Tensor
     """Fitted values (k,)."""
-    linear: Linearization
-    """Segments at the fit, in parameters measured from the model's world, with the deviations that each segment has of
-    its own projected out."""
+    plain: Linearization
+    """Segments at the fit under the contact law, in parameters measured from the model's world, with the deviations
+    that each segment has of its own projected out."""
+    beside: Linearization
+    """The same beside errors of the impulses of impacts, those of the fit without a candidate."""
     columns: tuple[int, ...]
     """Columns of the candidate's parameters in the linearization; empty without one."""
     errors: ImpulseErrors
-    """Errors of the impulses."""
-    price: Array
-    """Price (B,) of these in each segment."""
+    """The errors."""
 
     @property
     def start(self) -> Array:
         """The fitted parameters (P) in the order and from the origin of the linearization."""
         moved = dict(zip((p.name for p in self.parameters), (self.values - self.centre).tolist(), strict=True))
-        return np.array([moved.get(p.name, 0.0) for p in self.linear.parameters])
+        return np.array([moved.get(p.name, 0.0) for p in self.plain.parameters])
 
     @property
     def every(self) -> list[int]:
         """Columns of all parameters, the model's first."""
-        return [*range(self.linear.base), *self.columns]
+        return [*range(self.plain.base), *self.columns]
 
 
 def candidate_fits(
@@ -133,30 +133,37 @@ class _Place:
         """Return the segments linearised here, in parameters measured from the model's world."""
         columns = torch.stack([p.decode(self.values[k]) for k, p in enumerate(self.parameters)])[None]
         world = apply_parameters(self.world, self.parameters, columns)
-        at = linearize_contact(self.segments.in_world(world), world, (), groups)
-        linear = at.linear
-        if none is not None:
-            linear = replace(linear, chi2=linear.chi2 + at.price - none.price)
+        at = linearize_contact(self.segments.in_world(world), world, (), groups, None if none is None else none.errors)
         names = {p.name for p in self.own}
-        own = tuple(k for k, p in enumerate(linear.parameters) if p.name in names)
-        # the effect comes last, and deviations of its own would explain it away
-        linear = with_segment_parameters(replace(linear, base=linear.base - len(own)))
-        wide = [
-            replace(p, prior=(p.prior[0], WIDE * p.prior[1])) if k in own else p
-            for k, p in enumerate(linear.parameters)
-        ]
-        prior = np.where(np.isin(np.arange(len(wide)), own), 0.0, linear.prior)
+        own = tuple(k for k, p in enumerate(at.plain.parameters) if p.name in names)
         fit = CandidateFit(
             segments=self.segments,
             parameters=self.parameters,
             centre=self.centre,
             values=self.values,
-            linear=replace(linear, parameters=tuple(wide), prior=prior),
+            plain=_without_prior(at.plain, own),
+            beside=_without_prior(at.beside, own),
             columns=own,
             errors=at.errors,
-            price=at.price,
         )
-        return replace(fit, linear=measured_from(fit.linear, fit.start))
+        start = fit.start
+        return replace(fit, plain=measured_from(fit.plain, start), beside=measured_from(fit.beside, start))
+
+
+def _without_prior(linear: Linearization, own: Sequence[int]) -> Linearization:
+    """Return a linearization with deviations of each segment, in which a candidate's parameters have hardly a prior.
+
+    Args:
+        linear: At a fit, the candidate's parameters last.
+        own: Columns of the candidate's parameters.
+    """
+    # deviations of the effect's own would explain it away
+    linear = with_segment_parameters(replace(linear, base=linear.base - len(own)))
+    wide = [
+        replace(p, prior=(p.prior[0], WIDE * p.prior[1])) if k in own else p for k, p in enumerate(linear.parameters)
+    ]
+    prior = np.where(np.isin(np.arange(len(wide)), own), 0.0, linear.prior)
+    return replace(linear, parameters=tuple(wide), prior=prior)
 
 
 def _place(contact: Segments, world: World, evidence: Evidence | None) -> _Place:

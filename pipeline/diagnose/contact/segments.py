@@ -42,7 +42,7 @@ from ..evidence.robust_fit import (
 )
 from ..thresholds import THRESHOLDS, SegmentsThresholds
 from .candidate_fit import CandidateFit, candidate_fits
-from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
+from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, selected, tries_of
 
 Array = NDArray[np.float64]
 
@@ -70,22 +70,27 @@ class SegmentsTest(ContactTest):
         if data.segments is None or not variants:
             return []
         at = linearize_contact(data.segments, data.world, variants, data.prepared.groups)
-        first = _ranked(_linear_tests(at.linear, candidates, variants), data)
-        # an effect that impacts show widens their errors until it is in the model
-        under_law = {one.name: one.score for one in _ranked(_linear_tests(at.plain, candidates, variants), data)}
-        likely = {one.name: max(one.score, under_law[one.name]) for one in first}
-        first = [replace(one, first_score=likely[one.name]) for one in first]
-        if not any(self._is_likely(one) for one in first) or not any(self._can_be_named(one, data) for one in first):
-            return first
-        fitted = [one for one in first if _can_be_fitted(one)]
+        plain, beside = (_ranked(_linear_tests(one, candidates, variants), data) for one in (at.plain, at.beside))
+        scores = {one.name: max(one.score, other.score) for one in plain for other in beside if one.name == other.name}
+        likely = [replace(one, first_score=scores[one.name]) for one in plain]
+        if not any(map(self._is_likely, likely)) or not any(self._can_be_named(one, data) for one in likely):
+            return plain
+        fitted = [one for one in plain if _can_be_fitted(one)]
         none, fits = candidate_fits(data.segments, data.world, fitted, data.prepared.groups)
         at = linearize_contact(
             none.segments.in_world(data.world), data.world, variants, data.prepared.groups, none.errors
         )
-        tests = _linear_tests(at.linear, candidates, variants)
         tries = {candidates[place].effect.name: count for place, count in tries_of(variants).items()}
-        at_fits = [tests[0].beside(one, fits[one.name], tries[one.name]) for one in fitted]
-        return [replace(one, first_score=likely[one.name]) for one in _ranked([*tests, *at_fits], data)]
+        first = {one.name: one.score for one in plain}
+        tests = _linear_tests(at.plain, candidates, variants)
+        tests += [tests[0].at(one, fits[one.name].plain, fits[one.name], tries[one.name]) for one in fitted]
+        plain = [replace(one, first_score=first[one.name]) for one in _ranked(tests, data)]
+        if selected(self, plain, data):
+            return plain
+        tests = _linear_tests(at.beside, candidates, variants)
+        tests += [tests[0].at(one, fits[one.name].beside, fits[one.name], tries[one.name]) for one in fitted]
+        beside = [replace(one, first_score=scores[one.name], beside_errors=True) for one in _ranked(tests, data)]
+        return beside if selected(self, beside, data) else plain
 
     def _is_likely(self, one: Evidence) -> bool:
         """Return whether a nameable effect of one parameter has a score where it is absent; then effects are fitted."""
@@ -174,11 +179,11 @@ class _Test:
     lost: Array
     """Loss of each held-out episode without any."""
 
-    def beside(self, one: Evidence, fit: CandidateFit, tries: int) -> _Test:
+    def at(self, one: Evidence, linear: Linearization, fit: CandidateFit, tries: int) -> _Test:
         """Return the test of another candidate in segments linearised at its fit, against the same fit without any."""
-        at = robust_fit(fit.linear, fit.every, fit.start)
-        evidence = _judged(one.candidate, one.constants, at, self.without, _penalty(fit.linear), tries)
-        return replace(self, evidence=evidence, linear=fit.linear, columns=list(fit.columns), start=fit.start)
+        found = robust_fit(linear, fit.every, fit.start)
+        evidence = _judged(one.candidate, one.constants, found, self.without, _penalty(linear), tries)
+        return replace(self, evidence=evidence, linear=linear, columns=list(fit.columns), start=fit.start)
 
     @property
     def every(self) -> list[int]:

@@ -57,6 +57,8 @@ class Evidence:
     """Estimate and standard error by parameter; None where only the score test was made."""
     first_score: float = math.inf
     """Score in contact segments that were linearised without it, where it was judged at its fit."""
+    beside_errors: bool = False
+    """Whether it was judged beside errors of the impulses of impacts."""
     score: float = -math.inf
     """Fall of the loss of a contact test less the penalty of BIC; minus infinity in flight."""
     share: float = 0.0

@@ -64,7 +64,7 @@ def test_effects_are_fitted_only_where_one_of_them_could_be_named(
     def fits(first: list[Evidence]) -> bool:
         with monkeypatch.context() as patch:
             patch.setattr(segments_module, "_linear_tests", lambda *_: [])
-            patch.setattr(segments_module, "linearize_contact", lambda *_: SimpleNamespace(linear=1, plain=1))
+            patch.setattr(segments_module, "linearize_contact", lambda *_: SimpleNamespace(plain=1, beside=1))
             patch.setattr(segments_module, "_ranked", lambda *_: first)
             patch.setattr(segments_module, "candidate_fits", lambda *_: fitted())
             try:
@@ -81,6 +81,32 @@ def test_effects_are_fitted_only_where_one_of_them_could_be_named(
     assert fits([one, likely]) is (could or not flown)
     assert fits([one]) is (could and name in dict(LIMITS.alone))
     assert not fits([replace(one, score=-1.0), replace(likely, score=-1.0)])
+
+
+@pytest.mark.parametrize(("under_law", "beside_errors", "named"), [(100.0, 300.0, 100.0), (50.0, 300.0, 300.0)])
+def test_what_the_law_alone_names_stands_and_beside_errors_of_impulses_more_is_named(
+    under_law: float, beside_errors: float, named: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Errors of impulses are those of a model without the effect: a large effect widens and hides behind them."""
+    scores = {"plain": under_law, "beside": beside_errors}
+    lists = {kind: [replace(evidence("adhesion", one), gains=(20.0, 22.0, 24.0))] for kind, one in scores.items()}
+    segments = SimpleNamespace(in_world=lambda _: None)
+    data: Any = SimpleNamespace(
+        earlier={}, flown=False, explained=True, segments=segments, world=1, prepared=SimpleNamespace(groups=()),
+        variants=lambda *_: [SimpleNamespace(active=evidence("adhesion").candidate)],
+    )  # fmt: skip
+    monkeypatch.setattr(
+        segments_module, "linearize_contact", lambda *_: SimpleNamespace(plain="plain", beside="beside")
+    )
+    monkeypatch.setattr(segments_module, "_linear_tests", lambda linear, *_: [linear])
+    monkeypatch.setattr(segments_module, "_ranked", lambda tests, _: lists[tests[0]])
+    monkeypatch.setattr(segments_module, "_can_be_fitted", lambda _: False)
+    monkeypatch.setattr(segments_module, "tries_of", lambda _: {})
+    none = SimpleNamespace(segments=segments, errors=None)
+    monkeypatch.setattr(segments_module, "candidate_fits", lambda *_: (none, {}))
+    found = SegmentsTest().evidence(data, [])
+    assert [one.score for one in found] == [named]
+    assert found[0].beside_errors is (named == beside_errors)
 
 
 def test_a_fit_names_no_effect_without_a_score_where_it_is_absent() -> None:
