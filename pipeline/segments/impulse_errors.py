@@ -28,19 +28,15 @@ from .segment_fit import Linear
 from .segments import Segments
 from .thresholds import SEGMENT_THRESHOLDS
 
-LIMITS = SEGMENT_THRESHOLDS.phases
+PHASES, LIMITS = SEGMENT_THRESHOLDS.phases, SEGMENT_THRESHOLDS.impulse_errors
 
 KINDS = torch.tensor([0, 1, 1, 2, 3, 3])
 """Kind of error of each of the six components of an impulse: along the normal (0), along the impulse's tangent and
 across it (1), and the torques about the normal (2) and about these two tangents (3)."""
 SHARE = 0.02
 """Difference step: share of the impulse by which a component is moved up and down."""
-ARM = 0.3
-"""Lever arm of the torques in units of the body's size: a contact that is a corner moves by as much."""
 FIRST_SHARE, LEAST_SHARE = 0.1, 1e-3
 """Shares from which the estimate starts, and below which it does not go."""
-FREEDOM = 3.0
-"""Degrees of freedom of Student's t: the fewest with a variance."""
 ROUNDS = 60
 """Number of iterations of expectation-maximisation."""
 
@@ -110,7 +106,7 @@ def _strikes(segments: Segments, rollout: Rollout) -> tuple[Tensor, Tensor, Tens
     total = (record.impulse_n_s * record.normal).sum((-1, -2))
     mass = segments.world.bodies[0].mass[0]
     beyond = total - mass * weight
-    strikes = total > mass * (LIMITS.impact_weights * weight).clamp_min(LIMITS.impact_m_s)
+    strikes = total > mass * (PHASES.impact_weights * weight).clamp_min(PHASES.impact_m_s)
     frames = torch.arange(total.shape[1])
     # what the last frame shows of an impact is its place alone
     inside = (frames >= 1) & (frames < torch.tensor(segments.lengths)[:, None] - 1)
@@ -140,7 +136,7 @@ def _changes(
     tangent = tangent / tangent.norm(dim=-1, keepdim=True)
     axes = torch.stack((normal.expand_as(tangent), tangent, cross(normal.expand_as(tangent), tangent)), 1)
     force = impulse[:, None, None] * axes
-    torque = torch.cat((cross(arm[:, None].expand_as(force), force), ARM * size_of(body) * force), 1)
+    torque = torch.cat((cross(arm[:, None].expand_as(force), force), LIMITS.arm * size_of(body) * force), 1)
     turn = quat_to_matrix(quat)
     spin = (torch.linalg.inv(body.inertia[:1]) @ (turn.mT @ torque.mT)).mT
     linear = torch.cat((force / body.mass[0], torch.zeros_like(force)), 1)
@@ -206,7 +202,7 @@ def estimated_errors(segments: Segments, rows: Tensor, states: Tensor, impacts: 
         mean = torch.linalg.solve(precision, (std * normal.score)[..., None])[..., 0]
         spread = torch.linalg.inv(precision).diagonal(dim1=1, dim2=2)
         square = (std**2 * (mean**2 + spread)).unflatten(1, (-1, len(KINDS)))
-        weight = (FREEDOM + len(KINDS)) / (FREEDOM + (square / shares[KINDS] ** 2).sum(-1))
+        weight = (LIMITS.freedom + len(KINDS)) / (LIMITS.freedom + (square / shares[KINDS] ** 2).sum(-1))
         factor = weight.rsqrt()
         by_kind = rows.new_zeros(4).index_add(0, KINDS, (square * (weight * acts)[..., None]).sum((0, 1)))
         shares = (by_kind / number).sqrt().clamp_min(LEAST_SHARE)

@@ -402,6 +402,25 @@ class SessionThresholds:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ImpulseErrorThresholds:
+    """What counts as an error of the impulse of an impact."""
+
+    freedom: float = threshold(
+        3.0,
+        "1",
+        "degrees of freedom of Student's t, by which errors of impulses are distributed",
+        "by argument: the fewest with a variance",
+        "scores of 4 development captures with 8 and with infinitely many differ by at most an eighth",
+    )
+    arm: float = threshold(
+        0.3,
+        "sizes",
+        "lever arm of errors that turn a body, per share of the normal impulse",
+        "by argument: in a corner that strikes instead of another one the impulse moves by as much",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SegmentThresholds:
     """All thresholds on segments that decide a verdict."""
 
@@ -427,6 +446,8 @@ class SegmentThresholds:
     """Whether a model describes the motion."""
     slow_errors: SlowErrorThresholds = SlowErrorThresholds()
     """Slow errors of flights."""
+    impulse_errors: ImpulseErrorThresholds = ImpulseErrorThresholds()
+    """Errors of the impulses of impacts."""
     sessions: SessionThresholds = SessionThresholds()
     """Scales of sessions."""
 

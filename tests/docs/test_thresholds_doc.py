@@ -89,10 +89,12 @@ NUMERICS = {
 """Numbers of modules in `pipeline/diagnose` outside of the table, each with the reason why it decides no verdict."""
 SEGMENT_NUMERICS = {
     "length of a warning": ("prepare.NAMED",),
+    "names of components": ("impulse_errors.KINDS",),
     "keeps a covariance solvable where nothing is used": ("impacts/flat.KNOWN_M_S",),
     "end of a descent": (
         "first_contact_fit.ITERATIONS, TOLERANCE",
         "impacts/fit.ITERATIONS, FALL",
+        "impulse_errors.ROUNDS",
         "input_checks.ENVELOPE_ITERATIONS",
         "mixed_model.ROUNDS",
         "random_effects.FIRST_ITERATIONS, ITERATIONS",
@@ -115,6 +117,7 @@ SEGMENT_NUMERICS = {
     ),
     "start of a descent, or lengths of a step that are tried": (
         "impacts/fit.SHARES",
+        "impulse_errors.FIRST_SHARE, LEAST_SHARE",
         "flights/variance_components.STARTS_S",
         "impacts/fit.WEIGH_AGAIN",
         "segment_states.DRAWS, STARTS",
@@ -128,6 +131,7 @@ SEGMENT_NUMERICS = {
     "step of differences": (
         "impacts/fit.STEP",
         "impacts/fit.TWIST_STEPS",
+        "impulse_errors.SHARE",
         "segments.PARAMETER_STEP",
         "sliding/residuals.PARAMETER_STEP",
         "sliding/residuals.STATE_STEPS",

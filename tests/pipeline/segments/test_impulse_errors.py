@@ -11,8 +11,8 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.physics import State, simulate
 from cgwm.pipeline.segments.impulse_errors import (
-    FREEDOM,
     KINDS,
+    LIMITS,
     Impacts,
     ImpulseErrors,
     estimated_errors,
@@ -83,7 +83,7 @@ def _synthetic(count: int, seed: int, factor: Any = None) -> tuple[Any, torch.Te
     rng = np.random.default_rng(seed)
     states = rng.standard_normal((count, 10, 6, STATE_SIZE))
     columns = 100 * rng.standard_normal((count, 10, 6, 2 * len(KINDS)))
-    wide = 1 / np.sqrt(rng.chisquare(FREEDOM, (count, 2)) / FREEDOM) if factor is None else factor
+    wide = 1 / np.sqrt(rng.chisquare(LIMITS.freedom, (count, 2)) / LIMITS.freedom) if factor is None else factor
     drawn = np.repeat(wide, len(KINDS), 1) * np.tile(SHARES[KINDS.numpy()], 2) * rng.standard_normal((count, 12))
     rows = rng.standard_normal((count, 10, 6)) + np.einsum("btck,bk->btc", columns, drawn)
     segments = SimpleNamespace(dof=torch.full((count,), 60.0 - STATE_SIZE))
