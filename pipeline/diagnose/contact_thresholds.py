@@ -70,6 +70,14 @@ class SlidingThresholds:
         "by argument: engines differ by as much",
         "with `score_flexible`: 3 of 100 cubes on report3, 0 of 100 on report4",
     )
+    least_way: float = threshold(
+        0.02,
+        "1",
+        "on fixed surfaces, instead of `least_size`: an effect is named that moves the body by this share of its way "
+        "in a piece",
+        "by argument: balls of MuJoCo that roll down a plate or a groove with nothing hidden are slower by 0.05 % to "
+        "0.3 % by the time constant of their contacts, and by 1 to 2 % with the smallest resistance that it takes",
+    )
     without_best: float = threshold(
         80.0,
         "chi2",

@@ -96,7 +96,10 @@ class Segments:
         moved, turned = seen.seen.sum(1), seen.has_orientation.sum(1)
         axes = seen.measured_axes.sum(-1)
         free = axes * (moved - 2).clamp_min(0) + 3 * (turned - 2).clamp_min(0)
-        return free.sum(-1)
+        if seen.carried is None:
+            return free.sum(-1)
+        lost = (seen.seen[:, :, 0] * seen.carried.square().sum((-1, -2))).sum(1)
+        return free.sum(-1) - lost * (1 - 2 / moved[:, 0].clamp_min(2.0))
 
     def select(self, items: Sequence[int]) -> Segments:
         """Return some of the segments."""
@@ -189,6 +192,8 @@ class Segments:
     def _innovations(self, seen: Observations, rows: Tensor) -> Tensor:
         """Return rows (B, T nf, 6, ...) of some of the segments as innovations, less what errors of times explain."""
         masks = torch.stack((seen.seen, seen.has_orientation), -1)
+        if seen.carried is not None:
+            rows = _off_carriers(rows, seen.carried)
         found = body_innovations(rows, seen.times_s, masks, self.noise_model)
         if seen.time_shift is None:
             return found
@@ -284,8 +289,18 @@ def _windows(whole: Observations, items: Sequence[Segment]) -> Observations:
         picked["spin_rad_s"] = torch.where(inside[..., None, None] > 0, spin, torch.nan)
     if whole.time_shift is not None:
         picked["time_shift"] = whole.time_shift[rows[:, None], place]
+    if whole.carried is not None:
+        picked["carried"] = whole.carried[rows[:, None], place]
     own = {name: value[rows] for name, value in whole.own_values.items()}
     return replace(whole, names=names, times_s=times, drives=drives, state=state, own_values=own, **picked)
+
+
+def _off_carriers(rows: Tensor, carried: Tensor) -> Tensor:
+    """Return rows (B, T, 6, ...) without the parts of positions along carrying directions (B, T, 3, 3)."""
+    moved, turned = rows.split(3, 2)
+    flat = moved.flatten(3) if moved.ndim > 3 else moved[..., None]
+    left = flat - carried.mT @ (carried @ flat)
+    return torch.cat((left.view_as(moved), turned), 2)
 
 
 def line_state(segments: Segments, frames: int) -> State:

@@ -187,6 +187,21 @@ class SlidingSegmentThresholds:
     shortest_s: float = threshold(0.15, "s", "shortest sliding segment; shorter ones are left to other tests")
     near_m: float = threshold(0.0015, "m", "height below which the lowest point is on the ground")
     near_sigmas: float = threshold(3.0, "sigma", "tolerance of `near_m` in addition")
+    near_surface_m: float = threshold(
+        0.004,
+        "m",
+        "the same above a fixed surface, which a mesh of few triangles describes to a millimetre or two",
+        BY_ARGUMENT,
+    )
+    longest_on_surface_s: float = threshold(
+        3.0, "s", "longest piece of rolling or sliding on fixed surfaces: all of it shows a small force"
+    )
+    flat: float = threshold(
+        0.999, "1", "cosine of the angle between the normals of a surface on which a body with edges slides", BY_ARGUMENT
+    )
+    kink_sigmas: float = threshold(
+        6.0, "sigma", "`jump_sigmas` for a jump of the velocity in any direction, on fixed surfaces", BY_ARGUMENT
+    )
     jump_m_s: float = threshold(0.12, "m/s", "jump of velocity that is an impact, which ends a sliding segment")
     jump_sigmas: float = threshold(4.0, "sigma", "the same, where it is more")
     tilting_rad_s: float = threshold(

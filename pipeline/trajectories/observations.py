@@ -62,6 +62,9 @@ class Observations:
     time_shift: Tensor | None = None
     """How far one standard deviation of the error of a frame's time moves positions [m] and turns rotations [rad, body
     axes], shape (B, T, nf, 6); None where times are right."""
+    carried: Tensor | None = None
+    """Of one free body, orthonormal directions along which surfaces carry it, in which positions do not count, as rows,
+    zero where there are fewer than three, shape (B, T, 3, 3); None where all directions count."""
 
     def with_own(self, world: World) -> Observations:
         """Return the items with the group-specific parameters that a world has for their episodes."""
@@ -142,6 +145,8 @@ class Observations:
             picked["spin_rad_s"] = self.spin_rad_s[index]
         if self.time_shift is not None:
             picked["time_shift"] = self.time_shift[index]
+        if self.carried is not None:
+            picked["carried"] = self.carried[index]
         own = {name: value[index] for name, value in self.own_values.items()}
         return replace(self, names=names, drives=drives, state=self.state.at(index), own_values=own, **picked)
 

@@ -18,6 +18,7 @@ import torch
 from ...segments.candidates import Candidate, Variant, with_added, with_variants
 from ...segments.sliding.descent import SlidingFit, information_by_segment
 from ...segments.sliding.fit import StartedSliding, fit_sliding, nuisance_parameters
+from ...segments.sliding.support import on_surfaces
 from ...segments.sliding.variant_fits import fits_of_variants
 from ..evidence.evidence import Evidence
 from ..thresholds import THRESHOLDS, SlidingThresholds
@@ -66,6 +67,8 @@ class SlidingTest(ContactTest):
             one for one in found if candidates[one[0].place] is best.candidate and one[0].constants == best.constants
         )
         told = replace(best, gains=held_out_gains(variant, fit, started))
+        if on_surfaces(data.world):
+            told = replace(told, way_share=way_share(started, variant, fit))
         if any(bar.passed(told) for bar in self.bars([told], data)):
             told = replace(told, pyramid_share=pyramid_share(started, variant, fit, least))
         return [told if one is best else one for one in evidence]
@@ -96,6 +99,8 @@ class SlidingTest(ContactTest):
             return ()
         if data.sliding is not None and not _unexplained(data.sliding, self.limits.surplus_sigmas):
             return ()
+        if best.way_share is not None and best.way_share < self.limits.least_way:
+            return ()
         parameters = len(best.candidate.effect.parameters)
         flexible = parameters > self.limits.few_parameters
         mapped = any(len(one.candidate.effect.parameters) > self.limits.many_parameters for one in equals)
@@ -104,7 +109,7 @@ class SlidingTest(ContactTest):
             score=self.limits.score_flexible if flexible or data.flown or doubted else self.limits.score,
             # what is unexplained in flight also acts during sliding
             share=self.limits.explained if data.explained else self.limits.share_sure,
-            size=self.limits.least_size,
+            size=self.limits.least_size if best.way_share is None else 0.0,
             # each slide tells how it is braked; what has more numbers than slides fits any
             carriers=min(parameters + 1, self.limits.carriers),
             carries=self.limits.carries,
@@ -155,6 +160,27 @@ def held_out_gains(variant: Variant, fit: SlidingFit, started: StartedSliding) -
         count, before, after = (float(one[mine].sum()) for one in (degrees, started.base.chi2, fit.chi2))
         gains.append(2 * count * math.log((before + count) / (max(after + float(predicted), 0.0) + count)))
     return tuple(gains)
+
+
+def way_share(started: StartedSliding, variant: Variant, fit: SlidingFit) -> float:
+    """Return how far an effect moves the body in the slides, as a share of their length, in the mean.
+
+    Args:
+        started: The sliding segments and their fit without effects.
+        variant: The effect.
+        fit: Its fit.
+    """
+    world, own = with_variants(started.segments.world, [variant], "contact")
+    known = nuisance_parameters(started.segments.world, started.flight_parameters)
+    segments = fit.segments.in_world(world)
+    values = fit.values.expand(len(segments.items), -1)
+    neutral = torch.cat((values[:, : len(known)], torch.zeros_like(values[:, len(known) :])), 1)
+    place = torch.tensor(segments.lengths) - 1
+    item = torch.arange(len(place))
+    ends = [segments.positions([*known, *own], one)[item, place, 0] for one in (values, neutral)]
+    start = segments.observations.state.position_m[:, segments.observations.free[0]]
+    moved, way = (ends[0] - ends[1]).norm(dim=-1), (ends[0] - start).norm(dim=-1)
+    return float(moved.nan_to_num(nan=0.0).sum() / way.sum().clamp_min(1e-9))
 
 
 def pyramid_share(started: StartedSliding, variant: Variant, fit: SlidingFit, base: float) -> float:

@@ -69,6 +69,8 @@ class Evidence:
     """Fall of chi2 without the episode in which it falls most; infinite where it was not computed."""
     pyramid_share: float = 0.0
     """Share of its fall of chi2 that a friction pyramid in its place reaches; 0 where it was not compared with one."""
+    way_share: float | None = None
+    """How far it moves a body that fixed surfaces carry, as a share of its way; None where it was not computed."""
     contact: Mapping[str, float] = field(default_factory=dict)
     """Contact parameters fitted jointly, by their name in the contact law, that a world with the effect takes over."""
 

@@ -156,7 +156,8 @@ class SlidingStart:
         """
         known, base = self.started.flight_parameters, self.started.base
         neutral = replace(base.segments.world, effects=at_neutral(world, names).effects)
-        start = base.values[0, :2]  # friction and height; the effects are neutral
+        # friction, and height of a ground; the effects are neutral
+        start = base.values[0, : 1 if neutral.ground_normal is None else 2]
         found = fit_sliding(neutral, [], [(base.segments, start)], known)[0]
         return self._estimate(world, names, neutral, found)
 

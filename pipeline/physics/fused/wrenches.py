@@ -44,8 +44,9 @@ _KNOWN = (
     ResidualWrench,
 )
 _DIRECTED = (AnisotropicFriction, FrictionPatch)
+_GROUND = (*_DIRECTED, Adhesion)
 _SURFACE = (
-    *_DIRECTED, Adhesion, RollingResistance, StribeckFriction, TorsionalFriction, VelocityRestitution, ViscousFriction,
+    *_GROUND, RollingResistance, StribeckFriction, TorsionalFriction, VelocityRestitution, ViscousFriction,
 )  # fmt: skip
 
 
@@ -87,9 +88,13 @@ def _no_law(world: World) -> str:
 def _against_surface(world: World, acting: Sequence[Effect]) -> str | None:
     """Return why the kernel does not support the contact effects of a world; None where it does, or without any."""
     surface = next((effect for effect in acting if isinstance(effect, _SURFACE)), None)
-    alone = len(world.bodies) == 1 and not world.surfaces
-    if surface is not None and (not alone or world.ground_normal is None):
-        return f"the kernel has '{surface.name}' for one body on the ground only"
+    if surface is not None and (len(world.bodies) > 1 or (world.ground_normal is None and not world.surfaces)):
+        return f"the kernel has '{surface.name}' for one body only, on a ground or fixed surfaces"
+    upon = next((effect for effect in acting if isinstance(effect, _GROUND)), None)
+    if upon is not None and (world.surfaces or world.ground_normal is None):
+        return f"the kernel has '{upon.name}' for one body on the ground only"
+    if surface is not None and world.surfaces and len(laws_in_use(world).laws) > 1:
+        return f"the kernel has '{surface.name}' beside fixed surfaces of one material only"
     directed = next((effect for effect in acting if isinstance(effect, _DIRECTED)), None)
     if directed is not None and world.ground_normal is not None and world.ground_normal.tolist() != [0.0, 0.0, 1.0]:
         return f"the kernel has '{directed.name}' for an upright ground only"

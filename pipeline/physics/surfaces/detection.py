@@ -114,6 +114,17 @@ def surface_gap(placed: Placed, surface: FixedSurface) -> Tensor:
     return torch.where(near & (gap < MOST_GAP_M), gap, torch.inf)
 
 
+@torch.no_grad()
+def points_within(placed: Placed, surface: FixedSurface, reach_m: float) -> Points:
+    """Return the points in all slots of a body with a surface whose gap is at most a reach; others are far away."""
+    still, fixed = placed.plain(), _plain(surface)
+    zero = torch.zeros_like(still.reference[:, 0])
+    nearby = _nearby(still, fixed, zero, zero + reach_m)
+    slot = torch.arange(nearby.depth.shape[1], device=zero.device).expand(len(zero), -1)
+    points = surface_points(still, fixed, nearby, slot)
+    return emptied(points, points.gap <= reach_m)
+
+
 def _chosen(placed: Placed, surface: FixedSurface) -> Tensor | None:
     """Return the indices of the spheres that a surface can touch; None for all."""
     return placed.body.on_plane if surface.kind == HALF_SPACE else None

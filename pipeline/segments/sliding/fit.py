@@ -19,14 +19,18 @@ from ...physics.state import State
 from ...physics.world import World
 from ...trajectories.bursts import without_grounded_bursts
 from ...trajectories.residuals import STATE_SIZE, TrajectoryResiduals
+from ...trajectories.segmentation import Segment
 from ..candidates import Together, Variant, base_parameters, base_values
+from ..contact_phases import is_round
 from ..linearization import linearize, sums
 from ..prepare import Prepared
 from ..segments import Segments, line_state
 from ..thresholds import SEGMENT_THRESHOLDS
 from .descent import ITERATIONS, SlidingFit, fit_groups
 from .residuals import soft_world
-from .segments import find_sliding_segments, grounded_states
+from .segments import find_sliding_segments, grounded_states, segments_on_surfaces
+from .sliding_noise import noise_of_fit
+from .support import on_surfaces
 
 LIMITS = SEGMENT_THRESHOLDS.sliding_data
 
@@ -66,7 +70,11 @@ class StartedSliding:
             world: The model's world.
             flight: Flights with fitted states; None where there are none.
         """
-        if not isinstance(world.contact, ContactLaw) or not prepared.has_orientation:
+        if not isinstance(world.contact, ContactLaw):
+            return None
+        if on_surfaces(world):
+            return StartedSliding._on_surfaces(prepared, world, flight)
+        if not prepared.has_orientation:
             return None
         prepared = replace(
             prepared, observations=without_grounded_bursts(prepared.observations, prepared.airborne, prepared.noise)
@@ -74,9 +82,39 @@ class StartedSliding:
         items = find_sliding_segments(world, prepared.observations, prepared.airborne, prepared.noise)
         if not items:
             return None
+        return StartedSliding._of_items(prepared, world, flight, items)
+
+    @staticmethod
+    def _on_surfaces(prepared: Prepared, world: World, flight: Segments | None) -> StartedSliding | None:
+        """Return the same where fixed surfaces carry the body.
+
+        Without flights, its rolls and slides show the noise. The turns of a ball do not count: it turns by its way over
+        its radius, which they tell ten times more exactly than positions, but not than triangles of a surface are.
+        """
+        if not prepared.has_orientation and not all(is_round(body) for body in world.bodies):
+            return None
+        whole = without_grounded_bursts(prepared.observations, prepared.airborne, prepared.noise)
+        if len(whole.free) != 1 or len(world.bodies) != 1:
+            return None
+        items, carrying = segments_on_surfaces(world, whole, prepared.airborne, prepared.noise)
+        if not items:
+            return None
+        whole = replace(whole, carried=carrying.carried)
+        if is_round(world.bodies[whole.free[0]]):
+            whole = replace(whole, has_orientation=torch.zeros_like(whole.has_orientation))
+        prepared = replace(prepared, observations=whole)
+        return StartedSliding._of_items(prepared, world, flight, items)
+
+    @staticmethod
+    def _of_items(
+        prepared: Prepared, world: World, flight: Segments | None, items: Sequence[Segment]
+    ) -> StartedSliding:
+        """Start sliding segments."""
         soft = soft_world(world)
         segments = prepared.segments("contact", soft, items)
         separate, friction = _started(segments, float(world.contact.friction[0]))
+        if on_surfaces(world) and prepared.flight is None:
+            separate = with_own_noise(separate)
         segments = separate.segments
         flight_parameters = _flight_priors(flight, soft, prepared.groups)
         base = _base(segments, (friction, world.contact.friction[0].log().to(friction)), flight_parameters)
@@ -110,6 +148,14 @@ def _started(segments: Segments, known: float) -> tuple[SlidingFit, Tensor]:
     states = found.segments.observations.state.at(best)
     alone = SlidingFit(segments.with_state(states), found.chi2[best], found.values[best], found.information[best])
     return alone, friction
+
+
+def with_own_noise(alone: SlidingFit) -> SlidingFit:
+    """Return fits of single segments with the noise that their residuals have, fitted again."""
+    noise, model = noise_of_fit(alone.segments)
+    segments, count = replace(alone.segments, noise=noise, noise_model=model), len(alone.chi2)
+    free = torch.zeros(count, 1, dtype=torch.long)
+    return fit_groups(segments, [FRICTION], alone.values, free, torch.arange(count), HELD_ITERATIONS)
 
 
 def fit_sliding(
@@ -246,8 +292,9 @@ def noiseless_misfits(
 
 
 def nuisance_parameters(world: World, flight_parameters: Sequence[Parameter]) -> list[Parameter]:
-    """Return the nuisance parameters of sliding: friction, ground height, contact effects, flight parameters."""
-    return [FRICTION, GROUND_SHIFT, *contact_effect_parameters(world), *flight_parameters]
+    """Return the nuisance parameters of sliding: friction, height of a ground, contact effects, flight parameters."""
+    ground = [GROUND_SHIFT] if world.ground_normal is not None else []
+    return [FRICTION, *ground, *contact_effect_parameters(world), *flight_parameters]
 
 
 def contact_effect_parameters(world: World) -> list[Parameter]:

@@ -93,7 +93,9 @@ INLINE void touch_plane(const Problem& problem, const Environment& env, const Ow
     } else
 #endif
     EACH_CONTACT(list, first, count) share_out(list[i], crowd(moments, motion, list[i]), weights[i]);
-#if SURFACE
+#if SURFACE && PAIRED
+    surfaces(own.lanes, env.laws[0], motion, list, weights, first, count);
+#elif SURFACE
     Real total = Real(0);
     EACH_CONTACT(list, first, count) total += weights[i];
     total = own.lanes.sum(total);
@@ -255,7 +257,7 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
         free_omegas[b] = motions[b].omega;
     }
 #endif
-#if SURFACE
+#if SURFACE && !PAIRED
 #if WIDE
     Real touching = Real(0);
     EACH_CONTACT(list, 0, count) touching += choose(list[i].on, Real(1), Real(0));
@@ -320,6 +322,12 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
             if (sweep >= 0) c.impulse = swept(c, env.laws[0], relative_velocity(c, motions));
             linear[c.a] = linear[c.a] + c.impulse;
             angular[c.a] = angular[c.a] + cross(c.arm, c.impulse);
+#if SURFACE
+            if (env.laws[0].surface.twisting) {
+                if (sweep >= 0) c.turning = turned_by(c, env.laws[0], motions[c.a]);
+                angular[c.a] = angular[c.a] + c.turning;
+            }
+#endif
             if (c.b >= 0) {
                 linear[c.b] = linear[c.b] - c.impulse;
                 angular[c.b] = angular[c.b] - cross(c.arm_b, c.impulse);

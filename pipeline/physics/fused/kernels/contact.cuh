@@ -5,8 +5,15 @@ struct Contact {  // world frame, impulse on body a
     Real friction;
 #endif
 #if SURFACE
-    Real friction, steady_x, steady_y;  // steady: fixed impulses (viscosity)
-    Vec turning;                        // angular impulse of rolling and torsional friction
+    Real friction;
+#if PAIRED
+    Vec steady;                // fixed impulse (viscosity)
+    Real stiffness, damping;   // of its law, at the speed at which it meets
+    Real across, about;        // angular mass that it may stop across its normal and about it
+#else
+    Real steady_x, steady_y;  // fixed impulses (viscosity)
+#endif
+    Vec turning;  // angular impulse of rolling and torsional friction
 #if ELLIPTIC
     Ellipse ellipse;  // replaces the friction coefficient
 #endif

@@ -109,6 +109,13 @@ INLINE Real aim(const Law& law, Real gap, Real speed) {
     return wanted_speed(gap, speed, law.step_s, law.inverse_step, stiffness, damping);
 }
 
+#if SURFACE && PAIRED
+// The same of a contact that keeps what its law is at the speed at which it meets.
+INLINE Real aim(const Law& law, const Contact& c, Real speed) {
+    return wanted_speed(c.gap, speed, law.step_s, law.inverse_step, c.stiffness, c.damping);
+}
+#endif
+
 // Sets the target velocity of a contact and returns whether it touches. `stop_n` and `stop_t` temporarily hold its
 // effective mass and its tangential mobility, until `share_out` replaces them. `weight` is its weight among redundant
 // contacts.
@@ -125,6 +132,9 @@ INLINE Flag prepare(Contact& c, const Law& law, Real gap, Real speed, Real inver
     if (!some(touches)) return touches;
     Real depth = choose(plain(ahead) < plain(gap), -ahead, -gap);
     weight = choose(touches, at_most(at_least(Number(1.0 / ONSET_M) * depth, Number(0)), Number(1)), weight);
+#if SURFACE && PAIRED
+    response(law.surface, law.step_s, speed, c.stiffness, c.damping);
+#endif
     c.target = aim(law, gap, speed);
     c.stop_n = reciprocal(inverse_mass);
     c.stop_t = mobility - inverse_mass;
@@ -152,6 +162,9 @@ INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
 #if PAIRED
     Real speed = dot(relative, c.normal), before = dot(c.impulse, c.normal);
     Vec wanted = (c.impulse - before * c.normal) - c.stop_t * (relative - speed * c.normal);
+#if SURFACE
+    wanted = wanted - c.steady;
+#endif
     Real wanted2 = dot(wanted, wanted);
 #else
     Real speed = relative.z, before = c.impulse.z;
@@ -180,7 +193,9 @@ INLINE Vec swept(const Contact& c, const Law& law, Vec relative) {
     Real scale = Real(1);
     if (!every(sticks)) scale = choose(sticks, scale, most * inverse_root(wanted2 + Real(Number(1e-24))));
     scale = at_most(scale, Number(1));
-#if PAIRED
+#if PAIRED && SURFACE
+    return along * c.normal + scale * wanted + c.steady;
+#elif PAIRED
     return along * c.normal + scale * wanted;
 #elif SURFACE
     return vec(scale * x + c.steady_x, scale * y + c.steady_y, along);
@@ -228,6 +243,40 @@ INLINE Flag touch_ground(Contact& c, const Law& law, const Moving& a, Vec arm, R
 }
 
 #if SURFACE
+#if PAIRED
+// Sets the effects of a surface on a contact with it: friction at its slip, and viscous drag, which is distributed among
+// all contacts of the pair by weight. `total` is the sum of their weights, `touching` their number.
+INLINE void surface(Contact& c, const Law& law, const Moving& a, Real weight, Real total, Real touching) {
+    const Surface& s = law.surface;
+    Vec slip = a.velocity + cross(a.omega, c.arm);
+    slip = slip - dot(slip, c.normal) * c.normal;
+    c.friction = friction_at(s, law.friction, Real(0), Real(0), root(dot(slip, slip) + Real(Number(1e-24))), Real(0));
+    Real drag = law.step_s * s.viscous * weight * reciprocal(at_least(total, Number(0.02)));
+    c.steady = -(drag * reciprocal(Real(Number(1)) + drag * reciprocal(c.stop_t))) * slip;
+    Real turns = dot(c.normal, a.inverse_inertia * c.normal);
+    c.about = reciprocal(turns * touching);
+    c.across = reciprocal((trace(a.inverse_inertia) - turns) * touching);
+    c.turning = none();
+}
+
+// Angular impulse of rolling and torsional friction after one iteration.
+INLINE Vec turned_by(const Contact& c, const Law& law, const Moving& a) {
+    Real spin = dot(a.omega, c.normal), twist = dot(c.turning, c.normal), along = dot(c.impulse, c.normal);
+    Vec roll = (c.turning - twist * c.normal) - c.across * (a.omega - spin * c.normal);
+    twist = twist - c.about * spin;
+    roll = shortened(dot(roll, roll), law.surface.rolling * along) * roll;
+    return roll + (shortened(twist * twist, law.surface.torsion * along) * twist) * c.normal;
+}
+
+// Sets these effects on the contacts of a pair from `first` to `count`.
+INLINE void surfaces(const Lanes& lanes, const Law& law, const Moving& a, Contact* list, const Real* weights, int first,
+                     int count) {
+    Real total = Real(0), touching = Real(lanes.sum(Number(count - first)));
+    EACH_CONTACT(list, first, count) total += weights[i];
+    total = lanes.sum(total);
+    EACH_CONTACT(list, first, count) surface(list[i], law, a, weights[i], total, touching);
+}
+#else
 // Sets the effects of the surface on a ground contact: local friction, and viscous drag, which is distributed among all
 // contacts by weight; `total` is the sum of their weights.
 INLINE void surface(Contact& c, const Law& law, const Moving& a, Vec com, Real weight, Real total) {
@@ -253,4 +302,5 @@ INLINE Vec turned_by(const Contact& c, const Law& law, const Moving& a, Real acr
     Real roll = shortened(x * x + y * y, law.surface.rolling * c.impulse.z);
     return vec(roll * x, roll * y, shortened(z * z, law.surface.torsion * c.impulse.z) * z);
 }
+#endif
 #endif

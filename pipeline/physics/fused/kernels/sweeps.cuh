@@ -57,6 +57,9 @@ INLINE Pushed pushed_by(const Lanes& lanes, const Contact* list, int first, int 
         const Contact& c = list[i];
         sum.linear = sum.linear + c.impulse;
         sum.angular_a = sum.angular_a + cross(c.arm, c.impulse);
+#if SURFACE
+        sum.angular_a = sum.angular_a + c.turning;
+#endif
         if (both) sum.angular_b = sum.angular_b + cross(c.arm_b, c.impulse);
     }
     sum.linear = lanes.sum(sum.linear);
@@ -83,7 +86,12 @@ INLINE void aim_under_load(const Law& law, Contact* list, int first, int end, co
         if (plain(c.target) < Number(-1e29)) continue;
         Vec own = load.linear_a + cross(load.turn_a, c.arm);
         if (c.b >= 0) own = own + load.linear_b + cross(load.turn_b, c.arm_b);
-        c.target = aim(law, c.gap, dot(relative_velocity(c, motions) - own, c.normal));
+        Real speed = dot(relative_velocity(c, motions) - own, c.normal);
+#if SURFACE
+        c.target = aim(law, c, speed);
+#else
+        c.target = aim(law, c.gap, speed);
+#endif
     }
 }
 #endif

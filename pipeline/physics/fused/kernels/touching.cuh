@@ -137,7 +137,12 @@ __device__ int touch_surface(const Problem& problem, Environment& env, const Own
             weights[count++] = weight;
         }
     }
-    if (own.lanes.any(count > first)) share_out_pair(SHOWN_TO(own.lanes, env), list, weights, first, count, motions);
+    if (own.lanes.any(count > first)) {
+        share_out_pair(SHOWN_TO(own.lanes, env), list, weights, first, count, motions);
+#if SURFACE
+        surfaces(own.lanes, env.laws[0], motions[a], list, weights, first, count);
+#endif
+    }
     return count - first;
 }
 #endif
@@ -191,6 +196,10 @@ INLINE void split(Contact* list, int count, const int* groups) {
         Number share = most > 1 ? quotient(Number(1), Number(most)) : Number(1);
         c.stop_n = share * c.stop_n;
         c.stop_t = share * c.stop_t;
+#if SURFACE && PAIRED
+        c.across = share * c.across;
+        c.about = share * c.about;
+#endif
     }
 }
 #endif

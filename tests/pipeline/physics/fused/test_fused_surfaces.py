@@ -12,6 +12,8 @@ import torch
 from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, simulate
 from cgwm.pipeline.physics.devices import on_device
+from cgwm.pipeline.physics.effects.effect import ActiveEffect
+from cgwm.pipeline.physics.effects.registry import load_effect
 from cgwm.pipeline.physics.fused import simulate_fused
 from cgwm.pipeline.physics.fused.rollout import roll
 from cgwm.pipeline.runtime import kernel_build
@@ -91,11 +93,14 @@ def tossed(count: int, height: float = 0.07) -> State:
     )
 
 
-def agree(expected: Rollout, found: Rollout, tolerance: float = 1e-9) -> None:
-    names = [(one, one) for one in POSES]
-    for name, _ in names:
+def moves_alike(expected: Rollout, found: Rollout, tolerance: float = 1e-9) -> None:
+    for name in POSES:
         mine, its = getattr(found, name).cpu(), getattr(expected, name)
         torch.testing.assert_close(mine, its, rtol=tolerance, atol=tolerance, msg=lambda text, n=name: f"{n}: {text}")
+
+
+def agree(expected: Rollout, found: Rollout, tolerance: float = 1e-9) -> None:
+    moves_alike(expected, found, tolerance)
     mine, its = found.contacts, expected.contacts
     assert mine is not None and its is not None
     assert torch.equal(mine.body_b, its.body_b) and torch.equal(mine.sliding.cpu(), its.sliding)
@@ -126,6 +131,50 @@ def test_a_body_on_surfaces(fused: Fused, surfaces: tuple[Any, ...], lanes: int)
         expected = simulate(world, state, time, record_contacts=True)
         assert touched(expected.contacts) == {-2 - k for k in range(len(surfaces))}
         agree(expected, fused(world, state, time, True, lanes))
+
+
+EFFECTS = {
+    "stribeck_friction": {"d": 0.3, "v_s": 0.2},
+    "viscous_friction": {"c_v": 0.8},
+    "rolling_resistance": {"c_r": 3e-3},
+    "torsional_friction": {"c_t": 4e-3},
+    "velocity_restitution": {"r": 0.4},
+}
+
+
+def with_effects(world: World, names: tuple[str, ...]) -> World:
+    made = (ActiveEffect.of(load_effect(name), {k: batch(v) for k, v in EFFECTS[name].items()}) for name in names)
+    return replace(world, effects=tuple(made))
+
+
+@pytest.mark.parametrize(
+    ("surfaces", "names", "lanes"),
+    [
+        pytest.param(SHAPES, tuple(EFFECTS), 8, id="shapes-8", marks=pytest.mark.evidence),
+        pytest.param(MESHES, tuple(EFFECTS), 1, id="meshes-1"),
+        *(pytest.param(SHAPES, (one,), 1, id=one, marks=pytest.mark.evidence) for one in EFFECTS),
+    ],
+)
+def test_effects_of_contact_with_surfaces(fused: Fused, surfaces: Any, names: tuple[str, ...], lanes: int) -> None:
+    """Several pairs touch at once, beside a tilted ground: each has its own resistance to turning."""
+    plain, state, time = scene(surfaces, ground=True), tossed(6), times(0.15, 20)
+    plain = replace(plain, ground_offset=batch(-0.03))
+    with torch.no_grad():
+        world = with_effects(plain, names)
+        expected = simulate(world, state, time)
+        moves_alike(expected, fused(world, state, time, False, lanes))
+        assert (simulate(plain, state, time).position_m - expected.position_m).abs().max() > 1e-5
+
+
+def test_a_ball_rolls_down_a_groove_with_resistance(fused: Fused) -> None:
+    """Two contacts carry it: each brakes by the part of the spin across its normal, and the other by that about it."""
+    surfaces = (fixed.mesh_surface(*fixed.groove(0.6, 20, 0.04), quat=fixed.turn((0, 1, 0), 4)),)
+    world = scene(surfaces, ball_body(0.02))
+    state = state_of(((-0.2, 0.0, 0.0143 + 0.03), (1.0, 0, 0, 0), (0.3, 0.0, 0.0), (0.0, 20.0, 0.0)), count=2)
+    with torch.no_grad():
+        slowed = with_effects(world, ("rolling_resistance", "torsional_friction"))
+        expected = simulate(slowed, state, times(0.4, 20), record_contacts=True)
+        agree(expected, fused(slowed, state, times(0.4, 20), True))
 
 
 def test_two_bodies_a_tilted_ground_and_surfaces(fused: Fused) -> None:

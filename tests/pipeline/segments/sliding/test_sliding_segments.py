@@ -33,6 +33,7 @@ TIMES = np.arange(60) / RATE_HZ
 ALL = np.ones(60, bool)
 SEEN = _SeenFrames(torch.arange(60), TIMES, [slice(0, 60)])
 BOX, BALL = world_of(box_body()), world_of(ball_body(HALF_M))
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
 
 
 def measured(world: World, height_m: np.ndarray, turn: np.ndarray | None = None) -> Observations:
@@ -71,44 +72,44 @@ def test_windows_reach_equally_far_on_both_sides() -> None:
 def test_a_jump_of_the_speed_is_an_impact_with_the_frames_beside_it(world: World, share: float, found: bool) -> None:
     kink = share * LIMITS.jump_m_s * np.maximum(TIMES - TIMES[30], 0.0)
     whole = measured(world, kink + 2 * TIMES**2)
-    at = np.flatnonzero(_impacts(world, whole, SEEN, NOISE, ALL))
+    at = np.flatnonzero(_impacts(world.bodies[0], UP, whole, SEEN, NOISE, ALL))
     assert (at.tolist() == [29, 30, 31]) if found else (len(at) == 0)
     asked = ALL & (np.arange(60) < 30)  # only the frame before the jump knows of it
-    at = np.flatnonzero(_impacts(world, whole, SEEN, NOISE, asked)[:30])
+    at = np.flatnonzero(_impacts(world.bodies[0], UP, whole, SEEN, NOISE, asked)[:30])
     assert at.tolist() == [29] * found
     noisy = Noise(share * NOISE.position_m * 1e3, NOISE.rotation_rad)  # what noise may do is none
-    assert not _impacts(world, whole, SEEN, noisy, ALL).any()
+    assert not _impacts(world.bodies[0], UP, whole, SEEN, noisy, ALL).any()
     edge = measured(world, 9 * LIMITS.jump_m_s * np.maximum(TIMES - TIMES[1], 0.0))
-    assert not _impacts(world, edge, SEEN, NOISE, ALL)[:1].any()
+    assert not _impacts(world.bodies[0], UP, edge, SEEN, NOISE, ALL)[:1].any()
 
 
 @pytest.mark.parametrize(("share", "found"), [(1.05, True), (0.95, False)])
 def test_a_jump_of_the_tilting_is_an_impact_of_a_body_with_edges(share: float, found: bool) -> None:
     rate = share * LIMITS.jump_m_s / size_of(BOX.bodies[0])
     tilt = np.outer(rate * np.maximum(TIMES - TIMES[30], 0.0), [0.6, 0.8, 0.0])
-    at = np.flatnonzero(_impacts(BOX, measured(BOX, 0 * TIMES, tilt), SEEN, NOISE, ALL))
+    at = np.flatnonzero(_impacts(BOX.bodies[0], UP, measured(BOX, 0 * TIMES, tilt), SEEN, NOISE, ALL))
     assert (at.tolist() == [29, 30, 31]) if found else (len(at) == 0)
     spin = np.outer(5 * rate * np.maximum(TIMES - TIMES[30], 0.0), [0.0, 0.0, 1.0])
-    assert not _impacts(BOX, measured(BOX, 0 * TIMES, spin), SEEN, NOISE, ALL).any()
-    assert not _impacts(BALL, measured(BALL, 0 * TIMES, 5 * tilt), SEEN, NOISE, ALL).any()
+    assert not _impacts(BOX.bodies[0], UP, measured(BOX, 0 * TIMES, spin), SEEN, NOISE, ALL).any()
+    assert not _impacts(BALL.bodies[0], UP, measured(BALL, 0 * TIMES, 5 * tilt), SEEN, NOISE, ALL).any()
     unknown = measured(BOX, 0 * TIMES, tilt)
     unknown = replace(unknown, has_orientation=0 * unknown.has_orientation)
-    assert not _impacts(BOX, unknown, SEEN, NOISE, ALL).any()
+    assert not _impacts(BOX.bodies[0], UP, unknown, SEEN, NOISE, ALL).any()
 
 
 @pytest.mark.parametrize(("share", "found"), [(1.03, True), (0.97, False)])
 def test_a_body_that_tilts_turns_over_an_edge(share: float, found: bool) -> None:
     tilt = np.outer(share * LIMITS.tilting_rad_s * TIMES, [0.6, 0.8, 0.0])
-    assert _tilting(BOX, measured(BOX, 0 * TIMES, tilt), SEEN, NOISE.rotation_rad, ALL).all() == found
+    assert _tilting(UP, measured(BOX, 0 * TIMES, tilt), SEEN, NOISE.rotation_rad, ALL).all() == found
     spin = np.outer(9 * TIMES, [0.0, 0.0, 1.0])
-    assert not _tilting(BOX, measured(BOX, 0 * TIMES, spin), SEEN, NOISE.rotation_rad, ALL).any()
-    assert not _tilting(BOX, measured(BOX, 0 * TIMES, tilt), SEEN, 0.05, ALL).any()
+    assert not _tilting(UP, measured(BOX, 0 * TIMES, spin), SEEN, NOISE.rotation_rad, ALL).any()
+    assert not _tilting(UP, measured(BOX, 0 * TIMES, tilt), SEEN, 0.05, ALL).any()
     few = measured(BOX, 0 * TIMES, tilt)
     marks = torch.zeros_like(few.has_orientation)
     marks[:, ::6] = 1  # at most two in a window
-    assert not _tilting(BOX, replace(few, has_orientation=marks), SEEN, NOISE.rotation_rad, ALL).any()
+    assert not _tilting(UP, replace(few, has_orientation=marks), SEEN, NOISE.rotation_rad, ALL).any()
     marks[:, ::3] = 1
-    some = _tilting(BOX, replace(few, has_orientation=marks), SEEN, NOISE.rotation_rad, ALL)
+    some = _tilting(UP, replace(few, has_orientation=marks), SEEN, NOISE.rotation_rad, ALL)
     assert bool(some[8:-8].any()) == found
 
 
@@ -116,13 +117,13 @@ def test_steady_stretches_are_cut_at_gaps_and_into_equal_parts() -> None:
     times = np.arange(200) / RATE_HZ
     steady = np.ones(200, np.bool_)
     steady[10], steady[150:] = False, False
-    assert _parts(times, steady) == [(11, 57), (57, 103), (103, 149)]  # 1.38 s in three
+    assert _parts(times, steady, LIMITS.longest_s) == [(11, 57), (57, 103), (103, 149)]  # 1.38 s in three
     short = np.zeros(200, np.bool_)
     least = round(LIMITS.shortest_s * RATE_HZ)
     short[20 : 20 + least + 2], short[90 : 90 + least - 1] = True, True
-    assert _parts(times, short) == [(20, 20 + least + 1)]
+    assert _parts(times, short, LIMITS.longest_s) == [(20, 20 + least + 1)]
     late = times + 0.5 * (np.arange(200) >= 40)
-    assert _parts(late, np.arange(200) < 80) == [(0, 39), (40, 79)]
+    assert _parts(late, np.arange(200) < 80, LIMITS.longest_s) == [(0, 39), (40, 79)]
 
 
 def test_a_body_slides_while_it_is_on_the_ground_between_impacts() -> None:
