@@ -69,7 +69,7 @@ class SlidingTest(ContactTest):
         told = replace(best, gains=held_out_gains(variant, fit, started))
         if on_surfaces(data.world):
             told = replace(told, way_share=way_share(started, variant, fit))
-        if any(bar.passed(told) for bar in self.bars([told], data)):
+        if data.world.ground_normal is not None and any(bar.passed(told) for bar in self.bars([told], data)):
             told = replace(told, pyramid_share=pyramid_share(started, variant, fit, least))
         return [told if one is best else one for one in evidence]
 

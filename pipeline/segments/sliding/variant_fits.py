@@ -9,11 +9,13 @@ from torch import Tensor
 
 from ...physics.state import State
 from ..candidates import Variant
+from ..contact_phases import is_round
 from ..segments import Segments
 from ..thresholds import SEGMENT_THRESHOLDS
 from .descent import ITERATIONS, SlidingFit
 from .fit import StartedSliding, better_starts, fit_sliding
 from .separate_starts import separate_starts
+from .support import on_surfaces
 
 FIRST_ITERATIONS = 3
 """Number of iterations after which fits that are far behind are not continued."""
@@ -97,12 +99,14 @@ def _continued(
 ) -> dict[int, tuple[Variant, SlidingFit]]:
     """Return fits of variants continued from better starts, by the same keys."""
     world, known = started.segments.world, started.flight_parameters
+    rolls = on_surfaces(world) and is_round(world.bodies[started.segments.observations.free[0]])
     done: dict[int, tuple[Variant, SlidingFit]] = {}
     for part in batches([variant for variant, _ in some.values()]):
         mine = {k: fit for k, (variant, fit) in some.items() if any(variant is one for one in part)}
         many = len(part[0].parameters) > MANY
         plain = [(fit.segments, fit.values[0]) for fit in mine.values()]
-        starts = plain if many else better_starts(world, part, list(mine.values()), known)
+        # a ball that rolls down a surface does not come to rest by friction: there are no valleys
+        starts = plain if many or rolls else better_starts(world, part, list(mine.values()), known)
         again = fit_sliding(world, part, starts, known, iterations)
         done |= {k: (variant, fit) for k, variant, fit in zip(mine, part, again, strict=True)}
     return done
