@@ -50,12 +50,14 @@ from ..segments.ground_contact import on_the_ground
 from ..segments.group_parameters import with_known_groups
 from ..segments.input_checks import check_observability, check_units_and_geometry
 from ..segments.prepare import Prepared, prepare
+from ..segments.sliding.support import on_surfaces
 from .contact.detection_limits import DetectionLimit
 from .episodes import DiagnosedEpisodes, diagnosed_episodes
 from .evidence.evidence import Evidence
 from .law_export import require_law_file, save_law
 from .next_experiment.experiments import DEFAULT, Experiment, experiments_of, read_experiments
 from .next_experiment.motions import next_motions
+from .next_experiment.surface_motions import surface_motions
 from .next_experiment.throws import next_experiment
 from .remaining import held_out_of, remaining_of
 from .report.next_command import next_command
@@ -224,12 +226,15 @@ def report_and_findings(
     _, refused = admissible(world, library, prepared.has_orientation, prepared.observations.spin_rad_s is not None)
     clear = prepared.airborne & (prepared.observations.seen.amax(-1) > 0)
     seen = int((prepared.observations.seen.amax(-1) > 0).sum())
-    warnings = [*prepared.warnings, *motion_warnings(prepared), *noisy_warnings(prepared, findings)]
+    warnings = [*prepared.warnings, *motion_warnings(prepared, on_surfaces(world)), *noisy_warnings(prepared, findings)]
     warnings += [*law_warnings(findings), *size_warnings(findings), *misfit_warnings(findings)]
     law = _law(findings.flight.prepared, findings) if findings.verdict == "unexplained" or findings.remaining else None
     selected = () if findings.verdict == "unexplained" else tuple(c.evidence.candidate.spec for c in findings.chosen)
     groups = [c.equals for c in findings.chosen if len(c.equals) > 1] if selected else []
-    motions = next_motions(findings.flight.prepared, findings, library)
+    if on_surfaces(world):
+        motions = surface_motions(findings)
+    else:
+        motions = next_motions(findings.flight.prepared, findings, library)
     document = DiagnoseResult(
         verdict=findings.verdict,
         sentence=sentence(findings, law) + unseen_motion(prepared),
@@ -237,7 +242,9 @@ def report_and_findings(
         remaining_unexplained=findings.remaining,
         ranking=tuple(_ranked(e, findings) for e in findings.ranking),
         aliases=tuple(tuple(e.candidate.spec for e in group) for group in groups),
-        next_experiment=_next_throw(findings, motions, throws),
+        next_experiment=None
+        if on_surfaces(world) and prepared.flight is None
+        else _next_throw(findings, motions, throws),
         next_motions=motions,
         remaining=remaining_of(findings.flight),
         residual_law=law,

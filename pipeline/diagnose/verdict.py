@@ -12,6 +12,7 @@ from ..physics.world import World
 from ..segments.candidates import Candidate, without_effects
 from ..segments.prepare import Prepared
 from ..segments.sliding.fit import StartedSliding
+from ..segments.sliding.residuals import soft_world
 from .contact.contact_test import ContactTest
 from .contact.detection_limits import DetectionLimit
 from .contact.search import TESTS, Chosen, ContactFindings, with_contact
@@ -142,6 +143,8 @@ def _verdict(chosen: Sequence[Chosen], flown: FlightFindings) -> VerdictName:
 def _without_useless(contact: ContactFindings, least: float) -> ContactFindings:
     """Return the findings without the effects of contact that lower the error of held-out episodes too little.
 
+    What whole pieces on fixed surfaces show has predicted held-out ones; short pieces do not show it.
+
     Args:
         contact: The findings.
         least: Least mean fall of an episode's error, in its standard errors.
@@ -149,7 +152,8 @@ def _without_useless(contact: ContactFindings, least: float) -> ContactFindings:
     if contact.segments is None:
         return contact
     present = {active.effect.name for active in contact.world.effects}
-    named = {one.evidence.name for one in contact.chosen if one.where == "contact"} & present
+    short = [one.evidence for one in contact.chosen if one.where == "contact" and one.evidence.way_share is None]
+    named = {one.name for one in short} & present
     falls = {name: held_out_fall(contact.segments, contact.world, name) for name in named}
     useless = {name for name, fall in falls.items() if fall < least}
     world = without_effects(contact.world, *useless)
@@ -165,6 +169,10 @@ def _errors(contact: ContactFindings, flown: FlightFindings) -> dict[str, tuple[
         if one.evidence.name in own:
             continue
         segments = flown.segments if one.where == "flight" else contact.segments
+        if one.evidence.way_share is not None and contact.sliding is not None:
+            whole = contact.sliding.base.segments
+            errors[one.evidence.name] = held_out_errors(whole, soft_world(contact.world), one.evidence.name)
+            continue
         if segments is not None and one.evidence.name in present:
             errors[one.evidence.name] = held_out_errors(segments, contact.world, one.evidence.name)
     return errors

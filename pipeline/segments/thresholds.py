@@ -197,7 +197,10 @@ class SlidingSegmentThresholds:
         3.0, "s", "longest piece of rolling or sliding on fixed surfaces: all of it shows a small force"
     )
     flat: float = threshold(
-        0.999, "1", "cosine of the angle between the normals of a surface on which a body with edges slides", BY_ARGUMENT
+        0.999,
+        "1",
+        "cosine of the angle between the normals of a surface on which a body with edges slides",
+        BY_ARGUMENT,
     )
     kink_sigmas: float = threshold(
         6.0, "sigma", "`jump_sigmas` for a jump of the velocity in any direction, on fixed surfaces", BY_ARGUMENT

@@ -47,6 +47,8 @@ class SlidingTest(ContactTest):
             candidates: Candidates that the world admits.
         """
         blind = data.prepared.least_force_m_s2 > self.limits.flight_tells_m_s2
+        if on_surfaces(data.world):  # a ball that rolls there has the spin of its way, measured or not
+            candidates = [one for one in candidates if "unmeasured_spin" not in one.effect.needs]
         started, variants = data.sliding, data.variants(candidates, ("contact", "flight") if blind else ("contact",))
         if started is None or not variants:
             return []

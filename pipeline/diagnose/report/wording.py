@@ -221,12 +221,13 @@ def unseen_motion(prepared: Prepared) -> str:
     return ""
 
 
-def motion_warnings(prepared: Prepared) -> list[str]:
-    """Return a warning if the episodes have no contact or no flight."""
+def motion_warnings(prepared: Prepared, on_surfaces: bool = False) -> list[str]:
+    """Return a warning if the episodes have no contact or no flight, of which rolls on surfaces show some effects."""
     if not prepared.contact_items:
         return ["the tracks contain no usable contact: effects that act in contact cannot be tested."]
     if prepared.flight is None:
-        return ["the tracks contain no usable flight: effects that act in flight cannot be tested."]
+        tested = "are tested by rolling and sliding alone" if on_surfaces else "cannot be tested"
+        return [f"the tracks contain no usable flight: effects that act in flight {tested}."]
     return []
 
 

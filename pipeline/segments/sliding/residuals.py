@@ -217,7 +217,7 @@ def _basis(segments: Segments) -> Tensor:
 
 
 def _unturned(tangents: Tensor, spins: Tensor) -> Tensor:
-    """Return the changes of state (B, 12, 7) of a ball whose turns do not count: along tangents (B, 3, 2), and spins."""
+    """Return changes of state (B, 12, 7) of a ball whose turns do not count, along tangents (B, 3, 2), and spins."""
     basis = torch.zeros(len(tangents), STATE_SIZE, 7).to(tangents)
     basis[:, 0:3, 0:2] = STATE_STEPS[0] * tangents
     basis[:, 6:9, 2:4] = STATE_STEPS[2] * tangents

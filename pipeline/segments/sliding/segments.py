@@ -2,7 +2,8 @@
 
 There the normal force is the weight whatever the contact law, so that engines that differ widely in an impact agree,
 and the information about a friction grows with the fourth power of the time as in flight. So sliding segments are cut
-long, while other contacts are cut short. On fixed surfaces the normal force follows from their normals and the curvature of the path.
+long, while other contacts are cut short. On fixed surfaces the normal force follows from their normals and the
+curvature of the path.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from ..thresholds import SEGMENT_THRESHOLDS
 LIMITS = SEGMENT_THRESHOLDS.sliding_data
 
 APART = 0.06
-"""Share of the second moment of normals above which they carry in another direction, too: two that are 28 degrees apart.
+"""Share of the second moment of normals above which they carry in another direction, too: of two 28 degrees apart.
 Normals of neighbouring triangles of a curved surface are closer, those of the sides of a groove farther."""
 TOGETHER = 64
 """Number of poses, one after another in time, whose contacts are searched at once: near each other in space, they need
@@ -110,7 +110,9 @@ class Carrying:
             within_m: Distance [m] by which a contact that carries may be farther than the nearest one.
         """
         place, quat = whole.position_m[:, :, 0], whole.quat_wxyz[:, :, 0]
-        found = Support.of(world, whole.free[0], place.flatten(0, 1), quat.flatten(0, 1), LIMITS.near_surface_m + within_m)
+        found = Support.of(
+            world, whole.free[0], place.flatten(0, 1), quat.flatten(0, 1), LIMITS.near_surface_m + within_m
+        )
         shape = place.shape[:2]
         return Carrying(
             found.gap_m.amin(1).view(shape),

@@ -33,6 +33,7 @@ from cgwm.pipeline.runtime import kernel_build
 from cgwm.schemas import InputDataError, UsageError
 from cgwm.schemas.materials import of_pair, pair_of
 from helpers import fused_host, worlds
+from helpers.fixed_surfaces import half_space
 from helpers.worlds import F64, ball_body, batch, box_body, state_of, times
 from torch import Tensor
 
@@ -712,7 +713,10 @@ def test_what_the_kernel_does_not_have() -> None:
         effects = (active("linear_drag", c=0.1), active(name))
         assert reason_against(replace(world, effects=effects)) is None
         reason = reason_against(replace(two, effects=effects))
-        assert reason == f"the kernel has '{name}' for one body on the ground only"
+        assert reason == f"the kernel has '{name}' for one body only, on a ground or fixed surfaces"
+        track = replace(world, surfaces=(half_space(),), effects=effects)
+        upon = reason_against(track) == f"the kernel has '{name}' for one body on the ground only"
+        assert upon == (name in ("anisotropic_friction", "friction_patch", "adhesion"))
         assert "takes one" in (reason_against(replace(world, effects=(*effects, active(name)))) or "")
     tilted = replace(world, ground_normal=slope, effects=(active("anisotropic_friction"),))
     assert "upright ground" in (reason_against(tilted) or "")
