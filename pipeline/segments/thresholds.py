@@ -202,6 +202,13 @@ class SlidingSegmentThresholds:
         "cosine of the angle between the normals of a surface on which a body with edges slides",
         BY_ARGUMENT,
     )
+    apart: float = threshold(
+        0.06,
+        "1",
+        "share of the second moment of normals above which surfaces carry in another direction, too, as the sides of a "
+        "groove: that of two 28 degrees apart; neighbouring triangles of a curved surface are closer",
+        BY_ARGUMENT,
+    )
     kink_sigmas: float = threshold(
         6.0, "sigma", "`jump_sigmas` for a jump of the velocity in any direction, on fixed surfaces", BY_ARGUMENT
     )

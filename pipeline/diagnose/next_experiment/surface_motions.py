@@ -27,6 +27,7 @@ from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ...trajectories.residuals import STATE_SIZE, TrajectoryResiduals
 from ..contact.contact_test import variant_of
 from ..evidence.evidence import Evidence
+from ..thresholds import THRESHOLDS
 from ..verdict import Findings
 from .experiments import described
 
@@ -38,8 +39,6 @@ DURATION_S, RATE_HZ = 2.0, 100.0
 """Of the simulated motions."""
 MOST_RIVALS, MOST_MOTIONS = 3, 3
 """Numbers of rivals that motions are chosen for, and of motions."""
-LEAST_FALL = 12.0
-"""Chi2 that a motion has to leave for a rival, `lead` of the test that will judge it."""
 LEAST_S = 0.3
 """Shortest motion [s]."""
 
@@ -53,7 +52,9 @@ def surface_motions(findings: Findings) -> NextMotions | None:
     starts = _starts(started.base.segments)
     found = _Compared(started, equals[: 1 + MOST_RIVALS], starts).misfits()
     least = found.misfit.amin(0)
-    order = [k for k in least.argsort(descending=True).tolist() if float(least[k]) > LEAST_FALL][:MOST_MOTIONS]
+    order = [k for k in least.argsort(descending=True).tolist() if float(least[k]) > THRESHOLDS.sliding.lead][
+        :MOST_MOTIONS
+    ]
     if not order:
         return None
     index = started.segments.observations.free[0]

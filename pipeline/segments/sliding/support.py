@@ -22,9 +22,6 @@ from ..thresholds import SEGMENT_THRESHOLDS
 
 LIMITS = SEGMENT_THRESHOLDS.sliding_data
 
-APART = 0.06
-"""Share of the second moment of normals above which they carry in another direction, too: of two 28 degrees apart.
-Normals of neighbouring triangles of a curved surface are closer, those of the sides of a groove farther."""
 TOGETHER = 64
 """Number of poses, one after another in time, whose contacts are searched at once: near each other in space, they need
 few triangles."""
@@ -61,7 +58,7 @@ class Support:
         share = weight / weight.sum(1, keepdim=True).clamp_min(1.0)
         moment = (share[..., None] * self.normal).mT @ self.normal
         size, axes = torch.linalg.eigh(moment)
-        return axes.mT * (size > APART).to(axes)[..., None]
+        return axes.mT * (size > LIMITS.apart).to(axes)[..., None]
 
     def mean(self, within_m: float) -> Tensor:
         """Return the mean normals (n, 3) of the contacts within a distance [m], of length 1; zero without any."""
@@ -74,7 +71,7 @@ class Support:
         """
         weight = self.weights(within_m)
         wanted = (-self.gap_m - depth_m) * weight
-        inverse = torch.linalg.pinv(weight[..., None] * self.normal, rtol=APART**0.5)
+        inverse = torch.linalg.pinv(weight[..., None] * self.normal, rtol=LIMITS.apart**0.5)
         return (inverse @ wanted[..., None]).squeeze(-1)
 
     def rolling(self, within_m: float, velocity_m_s: Tensor, radius_m: float) -> Tensor:

@@ -12,7 +12,7 @@ from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.segments.sliding.fit import StartedSliding
 from cgwm.pipeline.segments.sliding.segments import segments_on_surfaces
-from cgwm.pipeline.segments.sliding.support import APART, Support, on_surfaces
+from cgwm.pipeline.segments.sliding.support import LIMITS, Support, on_surfaces
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers import fixed_surfaces as fixed
@@ -69,7 +69,7 @@ def test_what_carries_a_ball_on_a_plate_in_a_groove_and_in_the_air() -> None:
     spin = found.rolling(0.001, 0.3 * along.expand(3, 3), RADIUS_M)
     turns = torch.tensor([0, 0.3 / (RADIUS_M / 2**0.5), 0], dtype=F64)
     torch.testing.assert_close(spin[0], turns, rtol=1e-9, atol=1e-9)
-    assert float(np.sin(np.radians(14)) ** 2) < APART < float(np.sin(np.radians(15)) ** 2)
+    assert float(np.sin(np.radians(14)) ** 2) < LIMITS.apart < float(np.sin(np.radians(15)) ** 2)
 
 
 def test_pieces_are_as_long_as_the_roll_and_end_at_a_wall() -> None:
