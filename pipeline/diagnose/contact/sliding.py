@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from ...segments.candidates import Candidate, Variant, with_added, with_variants
+from ...segments.contact_phases import is_round
 from ...segments.sliding.descent import SlidingFit, information_by_segment
 from ...segments.sliding.fit import StartedSliding, fit_sliding, nuisance_parameters
 from ...segments.sliding.support import on_surfaces
@@ -24,6 +25,9 @@ from ..evidence.evidence import Evidence
 from ..thresholds import THRESHOLDS, SlidingThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
 from .friction_pyramid import FrictionPyramid
+
+TURNS = frozenset(("orientation", "spin", "unmeasured_spin"))
+"""Needs of effects that show in turns alone."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +51,9 @@ class SlidingTest(ContactTest):
             candidates: Candidates that the world admits.
         """
         blind = data.prepared.least_force_m_s2 > self.limits.flight_tells_m_s2
-        if on_surfaces(data.world):  # a ball that rolls there has the spin of its way, measured or not
-            candidates = [one for one in candidates if "unmeasured_spin" not in one.effect.needs]
+        if on_surfaces(data.world) and all(is_round(body) for body in data.world.bodies):
+            # turns of a ball do not count there, whose spin is that of its way, measured or not
+            candidates = [one for one in candidates if not TURNS.intersection(one.effect.needs)]
         started, variants = data.sliding, data.variants(candidates, ("contact", "flight") if blind else ("contact",))
         if started is None or not variants:
             return []
