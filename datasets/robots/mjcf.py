@@ -223,6 +223,7 @@ def servos_of(model: Any, joint: int) -> list[int]:
         and model.actuator_trnid[k, 0] == joint
         and (model.actuator_gaintype[k], model.actuator_biastype[k]) == (0, 1)
         and model.actuator_gainprm[k, 0] > 0 > model.actuator_biasprm[k, 1]
+        and model.actuator_gear[k, 0] != 0
     ]
 
 

@@ -192,7 +192,10 @@ SERVED = """<mujoco><compiler angle="radian"/><worldbody><geom name="floor" type
     ("actuators", "gain", "damping", "force", "targets"),
     [
         ('<position joint="z" kp="2" kv="0.3" gear="3" forcerange="-1 1"/>', 18.0, 2.8, 3.0, (-math.inf, math.inf)),
-        ('<motor joint="z"/><position joint="z" kp="2" ctrlrange="-0.5 1"/>', 2.0, 0.1, math.inf, (-0.5, 1.0)),
+        (
+            '<position joint="z" gear="0" ctrlrange="0 1"/><position joint="z" kp="2" ctrlrange="-0.5 1"/>',
+            2.0, 0.1, math.inf, (-0.5, 1.0),
+        ),
         (
             '<general joint="z" biastype="affine" gainprm="4" biasprm="1 -2 -0.3" ctrlrange="-1 1"/>',
             2.0, 0.4, math.inf, (-1.5, 2.5),
