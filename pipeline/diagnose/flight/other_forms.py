@@ -115,11 +115,19 @@ def other_forms(
             continue
         other = [one for one in kept if one.effect.name not in _alike(named)]
         more = [one for one in variants_of(other, world.gravity[0, :1]) if acts_in(one, "flight")]
-        laws, families = laws_of(motion, own, named), families_of(motion, own, named)
+        laws, families = laws_of(motion, own, named), families_of(motion, own, named, not sways(flight))
         forms = {words: field for family in families for words, field in family.forms.items()}
         fit = FormFit.of(motion, active[named[0]], [*laws, *forms.values()], more, scales)
         found.append(_compared(fit, named[0], len(laws), families, dispersion, _forces(named, candidates)))
     return found
+
+
+def sways(flight: Segments) -> bool:
+    """Return whether flights have accelerations of their own among the errors.
+
+    Whether these follow the place of a flight is told by their own test (`own_accelerations`).
+    """
+    return flight.noise_model.position.sway > 0
 
 
 def _forces(named: Sequence[str], candidates: Sequence[Candidate]) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
+from cgwm.pipeline.diagnose.flight import other_forms as forms_module
 from cgwm.pipeline.diagnose.flight.form_families import Family, weights_of
 from cgwm.pipeline.diagnose.flight.other_forms import OtherForms, _forces, log_mean, other_forms, own_form
 from cgwm.pipeline.diagnose.report import wording
@@ -175,6 +176,18 @@ def test_a_force_of_a_place_is_no_constant_force(effect: Effect, named: str, equ
     pulled = replace(ball, effects=(ActiveEffect.of(effect, {"k": 1.0}, ball.gravity[0, :1]),))
     found = form_of(pulled, named, equal=equal)
     assert found.likelier and word in found.words and "elsewhere" in found.then
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_places_of_flights_with_accelerations_of_their_own_are_left_to_their_own_test(
+    own: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight: Any = SimpleNamespace(noise_model=SimpleNamespace(position=SimpleNamespace(sway=40.0 * own)))
+    assert forms_module.sways(flight) == own
+    monkeypatch.setattr(forms_module, "sways", lambda _: own)
+    ball = world_with("ball")
+    pulled = replace(ball, effects=(ActiveEffect.of(Attractor(), {"k": 1.0}, ball.gravity[0, :1]),))
+    assert ("place" in form_of(pulled, "gravity_tilt").words) != own
 
 
 def test_a_drag_above_a_speed_is_no_drag() -> None:
