@@ -47,6 +47,8 @@ TASKS = ("fall", "push", "tip")
 ENGINES = ("rapier", "dart", "mujoco")
 WANTED = 8
 """Captures of every engine and task."""
+FRESH = 600
+"""Seed from which on captures are a later report, which has a section of its own."""
 _MM, _DEG, _DB = "translation_mm", "rotation_deg", "psnr_object_db"
 _DECIMALS = {_MM: 1, _DEG: 1, _DB: 2}
 _INTRODUCTION = (
@@ -113,6 +115,7 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """Return the page in Markdown."""
+    fresh, rows = [row for row in rows if row["seed"] >= FRESH], [row for row in rows if row["seed"] < FRESH]
     others = [row for row in rows if row["engine"] not in POOLED_WITHOUT]
     parts = [
         _INTRODUCTION.replace("{rows}", "; ".join(name for name in ROWS if name not in LEARNED)),
@@ -132,9 +135,24 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         here = _of(rows, task=task, engine=engine)
         if here:
             parts.append(f"**{task.capitalize()}, {engine}**\n\n{_pooled(here)}")
+    if fresh:
+        parts += _later(fresh)
     parts += ["## Learned rivals by capture", _learned(rows)]
     parts += ["## Captures", _counts(rows), "## Not run", _not_run(rows)]
     return "\n\n".join(parts) + "\n"
+
+
+def _later(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the parts of the page of a later report: by task, all three, against the floor, and which captures."""
+    seeds, commits = ({row[key] for row in rows} for key in ("seed", "commit"))
+    words = "Captures of which nothing was seen before (seed {}), at {}, all engines together.".format(
+        ", ".join(map(str, sorted(seeds))), ", ".join(f"`{one[:7]}`" for one in sorted(commits))
+    )
+    parts = [f"## Fresh captures\n\n{words}"]
+    parts += [f"**{task.capitalize()}**\n\n{_pooled(here)}" for task in TASKS if (here := _of(rows, task=task))]
+    parts += [f"**All three tasks**\n\n{_pooled(rows)}", f"**Against the floor**\n\n{_bars(rows)}"]
+    there = [" ".join((task, obj, ground, engine)) for engine, task, obj, ground, _ in captures_of(rows, REFERENCE)]
+    return [*parts, "Captures: " + ", ".join(sorted(there)).replace("_", " ") + "."]
 
 
 def _of(rows: Sequence[dict[str, Any]], **values: str) -> list[dict[str, Any]]:

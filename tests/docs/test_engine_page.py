@@ -74,6 +74,16 @@ def test_engines_count_alike_whatever_their_captures() -> None:
     assert "| cgwm | 3 | 5 | 100.0, 237.0 | 2.0, 2.0 | 17.12, 17.12 | 10, 10 |" in text
 
 
+def test_a_later_report_stands_alone() -> None:
+    rows = [row("cgwm", 500, [10.0]), row("floor", 500, [10.0])]
+    rows += [row("cgwm", 600, [30.0], "def1234567"), row("floor", 600, [20.0], "def1234567")]
+    text = engine_page.page([engine_page.reduced(one) for one in rows])
+    first, later = text.split("## Fresh captures")
+    assert "| fall | 1 | 1.00 | 1.00 | +0.00 |" in first and "30.0" not in first
+    assert "(seed 600), at `def1234`" in later and "| all three | 1 | 1.50 | 1.00 | +0.00 |" in later
+    assert "Captures: fall box wood rapier." in later
+
+
 def test_a_draft_goes_on_where_it_stopped(tmp_path: Path) -> None:
     draft, rng, rejected = Draft(tmp_path / "drafts" / "one.json"), np.random.default_rng(3), {"chaotic": 2}
     beginnings = [rng.standard_normal(13)]
