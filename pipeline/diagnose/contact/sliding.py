@@ -21,6 +21,7 @@ from ...segments.sliding.descent import SlidingFit, information_by_segment
 from ...segments.sliding.fit import StartedSliding, fit_sliding, nuisance_parameters
 from ...segments.sliding.support import on_surfaces
 from ...segments.sliding.variant_fits import fits_of_variants
+from ...segments.thresholds import SEGMENT_THRESHOLDS
 from ..evidence.evidence import Evidence
 from ..thresholds import THRESHOLDS, SlidingThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
@@ -108,6 +109,8 @@ class SlidingTest(ContactTest):
             return ()
         if best.way_share is not None and best.way_share < self.limits.least_way:
             return ()
+        if best.way_share is not None and data.sliding is not None and not _explained(best, data.sliding):
+            return ()
         parameters = len(best.candidate.effect.parameters)
         flexible = parameters > self.limits.few_parameters
         mapped = any(len(one.candidate.effect.parameters) > self.limits.many_parameters for one in equals)
@@ -138,6 +141,13 @@ def _unexplained(started: StartedSliding, sigmas: float) -> bool:
     """
     degrees = float(started.segments.dof.sum())
     return started.base.cost - degrees > sigmas * math.sqrt(2 * degrees)
+
+
+def _explained(best: Evidence, started: StartedSliding) -> bool:
+    """Return whether an effect leaves little on fixed surfaces: where their shapes are wrong, any force may help."""
+    degrees = float(started.segments.dof.sum())
+    left = started.base.cost - best.share * (started.base.cost - degrees)
+    return left < SEGMENT_THRESHOLDS.sliding_data.well_fitted * degrees
 
 
 def held_out_gains(variant: Variant, fit: SlidingFit, started: StartedSliding) -> tuple[float, ...]:
