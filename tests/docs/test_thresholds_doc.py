@@ -133,6 +133,7 @@ SEGMENT_NUMERICS = {
         "sliding/fit.FACTORS",
         "sliding/fit.START_FRAMES",
         "sliding/fit.START_FRICTION",
+        "sliding/variant_fits.GRIP",
     ),
     "step of differences": (
         "impacts/fit.STEP",

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ...physics.parameters import FRICTION
 from ...physics.state import State
 from ..candidates import Variant
 from ..contact_phases import is_round
@@ -24,6 +25,8 @@ MOST_PASSES = 5
 only, and a fit that has not converged would lose against one that needs fewer."""
 STALLED = 30.0
 """How many times as large as in the best fit of all the chi2 of a segment is that stalled."""
+GRIP = 0.3
+"""Friction with which a ball rolls down a surface of up to 46 degrees, from which fits start, too."""
 MANY = 4
 """Maximum number of parameters of a candidate that is fitted in a batch with smaller ones. The longest fit determines
 the time of a batch."""
@@ -45,6 +48,11 @@ def fits_of_variants(
     found: dict[int, tuple[Variant, SlidingFit]] = {}
     for part in batches(variants):
         tried = fit_sliding(soft_world, part, _starts(part, started), known, FIRST_ITERATIONS)
+        if on_surfaces(soft_world):
+            # without an effect the fit may let a ball slip that rolls
+            gripped = (started.separate.segments, torch.tensor([FRICTION.encode(GRIP)]).to(base.values))
+            others = fit_sliding(soft_world, part, [gripped] * len(part), known, FIRST_ITERATIONS)
+            tried = [min(pair, key=lambda fit: fit.cost) for pair in zip(tried, others, strict=True)]
         found |= {len(found) + k: one for k, one in enumerate(zip(part, tried, strict=True))}
     found = _continued(found, started, FIRST_ITERATIONS)
     gains = {k: base.cost - fit.cost for k, (_, fit) in found.items()}
