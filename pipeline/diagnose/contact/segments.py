@@ -72,8 +72,7 @@ class SegmentsTest(ContactTest):
         at = linearize_contact(data.segments, data.world, variants, data.prepared.groups)
         plain, beside = (_ranked(_linear_tests(one, candidates, variants), data) for one in (at.plain, at.beside))
         scores = {one.name: max(one.score, other.score) for one in plain for other in beside if one.name == other.name}
-        likely = [replace(one, first_score=scores[one.name]) for one in plain]
-        if not any(map(self._is_likely, likely)) or not any(self._can_be_named(one, data) for one in likely):
+        if not any(map(self._is_likely, plain)) or not any(self._can_be_named(one, data) for one in plain):
             return plain
         fitted = [one for one in plain if _can_be_fitted(one)]
         none, fits = candidate_fits(data.segments, data.world, fitted, data.prepared.groups)
@@ -95,13 +94,11 @@ class SegmentsTest(ContactTest):
     def _is_likely(self, one: Evidence) -> bool:
         """Return whether a nameable effect of one parameter has a score where it is absent; then effects are fitted."""
         single = len(one.candidate.effect.parameters) <= self.limits.few_parameters
-        return single and one.name in dict(self.limits.alone) and one.first_score > self.limits.first_score
+        return single and one.name in dict(self.limits.alone) and one.score > self.limits.first_score
 
     def _can_be_named(self, one: Evidence, data: ContactData) -> bool:
         """Return whether an effect with a score where it is absent could pass a bar, whatever its fit explains."""
-        return one.first_score > self.limits.first_score and (
-            self._is_shown(one, data) or self._stands_alone(one, data)
-        )
+        return one.score > self.limits.first_score and (self._is_shown(one, data) or self._stands_alone(one, data))
 
     def _is_shown(self, one: Evidence, data: ContactData) -> bool:
         """Return whether slides show an effect, too, so that a small score confirms it."""
