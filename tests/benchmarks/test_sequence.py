@@ -54,7 +54,7 @@ def test_motions_are_added_to_the_training_split(tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     make_capture(capture, case, tmp_path / "truth.json")
     before = Capture.open(capture).episodes("train")
-    sequence.add_motions(capture, case, [{"initial_state": STATE, "duration_s": 0.1}], 1)
+    sequence.add_motions(capture, case, [{"what": "a drop", "initial_state": STATE, "duration_s": 0.1}], 1)
     opened = Capture.open(capture)
     assert opened.episodes("train") == [*before, "r1_0"]
     track = opened.tracks("r1_0")[case.thing]
