@@ -134,7 +134,7 @@ def _present(world: World, episodes: Sequence[Episode]) -> frozenset[str]:
     spun = any(track.omega_body_rad_s is not None for track in measured)
     met = {
         "ground": world.ground_normal is not None,
-        "contact": world.ground_normal is not None or len(world.bodies) > 1,
+        "contact": world.ground_normal is not None or len(world.bodies) > 1 or bool(world.surfaces),
         "spin": turned or spun,
         "orientation": turned,
         "driven": any(body.motion == "driven" for body in world.bodies),

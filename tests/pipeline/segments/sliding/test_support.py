@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.tracks import Episode, Track
+from cgwm.pipeline.phys_geo.effects.requested_effects import _present
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.segments.sliding.fit import StartedSliding
@@ -101,3 +102,9 @@ def test_a_height_that_is_wrong_shows_nothing_and_a_resistance_its_size() -> Non
         chi2.append(started.base.cost / float(dof.sum()))
     assert 0.85 < chi2[0] < 1.15
     assert chi2[1] > 20
+
+
+def test_surfaces_are_something_to_touch_for_a_fit_of_an_effect_of_contact() -> None:
+    """Without that, the command that a diagnosis ends with is refused."""
+    assert "contact" in _present(world(PLATE), rolls())
+    assert "contact" not in _present(world(), rolls())
