@@ -268,7 +268,7 @@ class FlatImpactThresholds:
         math.radians(5.0),
         "rad",
         "angle between the face and the ground, before and after, up to which an impact is flat",
-        "simulated drops of a box in MuJoCo at tilts of 0.2 to 8 deg: the energies' ratio is constant to 3 % up to "
+        "simulated drops of a box in MuJoCo at tilts of 0.2 to 8 deg: the energies' ratio varies by 3 to 6 % up to "
         "4 deg at 2 m/s",
     )
     turning_share: float = threshold(

@@ -2,7 +2,7 @@
 
 Where a face meets the ground nearly flat, its corners touch one after the other, within milliseconds. What each takes
 off the body turns it, but how much energy the whole impact leaves hardly depends on that: in MuJoCo the square root of
-the ratio of the energies after and before is constant to 3 % up to a tilt of 2 deg at 1 m/s, 4 deg at 2 m/s and 8 deg
+the ratio of the energies after and before varies by 3 to 6 % up to a tilt of 2 deg at 1 m/s, 4 deg at 2 m/s and 8 deg
 at 5 m/s, while the share of it that turns the body rises from nothing to a tenth. So an impact is that of a ball with
 the energy of the motion along the normal and of the turning that tips the face: it tells the rebound, not friction. A
 body that comes down more tilted loses more, the slower it is: what flat impacts show of a rebound that falls with the
