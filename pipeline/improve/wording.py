@@ -9,7 +9,7 @@ from ...schemas import DiagnoseResult, ErrorRatio, ImproveStep, ImproveTest, Imp
 from ..compare.paired_difference import LEAST_EPISODES
 from ..diagnose.report.wording import organised
 from ..physics.effects.registry import split_units
-from ..report.page import listed
+from ..report.page import listed, number
 from .ladder import LEAST_FALL, Ladder
 
 WHY = {
@@ -47,8 +47,8 @@ def sentence(ladder: Ladder, test: ImproveTest | None) -> str:
         ):
             if ratio is not None:
                 words.append(
-                    f"On test episodes the {name} goes from {ratio.before * scale:.3g} to "
-                    f"{ratio.after * scale:.3g} {unit} (medians; {ratio_words(ratio)})."
+                    f"On test episodes the {name} goes from {number(ratio.before * scale)} to "
+                    f"{number(ratio.after * scale)} {unit} (medians; {ratio_words(ratio)})."
                 )
     worse = [] if test is None else worse_words(test)[-1:]
     return " ".join([*words, *worse, why_ended(ladder)])
