@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ from ..contact_phases import is_round
 from ..prepare import Prepared
 from ..segment_states import fit_states
 from ..thresholds import SEGMENT_THRESHOLDS
-from .velocities import Ends, Impacts, ends_of, impacts_between
+from .velocities import Ends, Impacts, between_flights, ends_of, falling_body, impacts_between
 
 LIMITS = SEGMENT_THRESHOLDS.flat_impacts
 
@@ -45,11 +46,9 @@ def flat_impacts(prepared: Prepared, world: World) -> Impacts | None:
         prepared: The episodes.
         world: In which flights are followed, with the effects that act in flight.
     """
-    whole = prepared.observations
-    alone = len(whole.free) == 1 and len(world.bodies) == 1 and world.ground_normal is not None
-    if prepared.flight is None or not (alone and prepared.has_orientation) or is_round(world.bodies[whole.free[0]]):
+    body = falling_body(prepared, world)
+    if prepared.flight is None or body is None or is_round(body):
         return None
-    body = world.bodies[whole.free[0]]
     normals, reaches = faces_of(body)
     if not len(normals):
         return None
@@ -69,17 +68,16 @@ def flat_impacts(prepared: Prepared, world: World) -> Impacts | None:
         for before, after in impacts_between(chains, starts, ends, good)
         if bool(speeds[0][1][before]) and bool(speeds[1][1][after])
     ]
-    if not kept:
+    found = between_flights(items, kept, starts, ends)
+    if found is None:
         return None
     a, b = (torch.tensor(side) for side in zip(*kept, strict=True))
-    return Impacts(
-        episode=np.array([items[k].episode for k in a.tolist()]),
-        place=ends.place[a],
-        rotation=ends.rotation[a],
+    return replace(
+        found,
         before=_along(-speeds[0][0][a], normal),
         after=_along(speeds[1][0][b], normal),
-        covariance_before=_covariance(ends.covariance[a], normal),
-        covariance_after=_covariance(starts.covariance[b], normal),
+        covariance_before=_covariance(found.covariance_before, normal),
+        covariance_after=_covariance(found.covariance_after, normal),
         reach_m=reach_m[a],
     )
 

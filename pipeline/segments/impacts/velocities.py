@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...geometry.rotation import quat_to_matrix
+from ...physics.body import Body
 from ...physics.effects.effect import changed_by_effects
 from ...physics.rollout import Rollout
 from ...physics.world import World
@@ -82,7 +83,20 @@ def measured_impacts(prepared: Prepared, world: World) -> Impacts | None:
         return None
     flights = fit_states(prepared.segments("flight", world, items))
     starts, ends, good = ends_of(flights)
-    kept = impacts_between(chains, starts, ends, good)
+    return between_flights(items, impacts_between(chains, starts, ends, good), starts, ends)
+
+
+def between_flights(
+    items: Sequence[Segment], kept: Sequence[tuple[int, int]], starts: Ends, ends: Ends
+) -> Impacts | None:
+    """Return the impacts between pairs of flights; None without any.
+
+    Args:
+        items: The flights (n).
+        kept: The flights before and after each impact.
+        starts: Starts of all flights.
+        ends: Their ends.
+    """
     if not kept:
         return None
     a, b = (torch.tensor(side) for side in zip(*kept, strict=True))
@@ -117,11 +131,17 @@ def impacts_between(
     ]
 
 
+def falling_body(prepared: Prepared, world: World) -> Body | None:
+    """Return the body of a scene with a single one above a ground, whose orientation was measured; None in others."""
+    free = prepared.observations.free
+    alone = len(free) == 1 and len(world.bodies) == 1 and world.ground_normal is not None
+    return world.bodies[free[0]] if alone and prepared.has_orientation else None
+
+
 def _measurable(prepared: Prepared, world: World) -> bool:
     """Return whether the scene is a single ball above a ground with measured orientation."""
-    whole = prepared.observations
-    alone = len(whole.free) == 1 and len(world.bodies) == 1 and world.ground_normal is not None
-    return alone and prepared.has_orientation and is_round(world.bodies[whole.free[0]])
+    body = falling_body(prepared, world)
+    return body is not None and is_round(body)
 
 
 def _neighbours(chains: Sequence[Sequence[Segment]]) -> list[tuple[int, int]]:
