@@ -17,7 +17,7 @@ be named, whatever its fit explains, and is not fitted.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ...physics.world import World
 from ...segments.candidates import Candidate, Variant, base_parameters, base_values, with_added
-from ...segments.linearization import Linearization, linearize_contact
+from ...segments.linearization import Linearization, linearize, linearize_contact
 from ...segments.segment_fit import refit
 from ...segments.segment_states import fit_states
 from ...segments.segments import Segments
@@ -69,27 +69,32 @@ class SegmentsTest(ContactTest):
         variants = [v for v in data.variants(candidates, ("contact", "flight")) if _acts_near_ground(v)]
         if data.segments is None or not variants:
             return []
-        at = linearize_contact(data.segments, data.world, variants, data.prepared.groups)
-        plain, beside = (_ranked(_linear_tests(one, candidates, variants), data) for one in (at.plain, at.beside))
-        scores = {one.name: max(one.score, other.score) for one in plain for other in beside if one.name == other.name}
+        groups = data.prepared.groups
+        linear = linearize(data.segments, data.world, variants, groups, robust=True)
+        plain = _ranked(_linear_tests(linear, candidates, variants), data)
         if not any(map(self._is_likely, plain)) or not any(self._can_be_named(one, data) for one in plain):
             return plain
         fitted = [one for one in plain if _can_be_fitted(one)]
-        none, fits = candidate_fits(data.segments, data.world, fitted, data.prepared.groups)
-        at = linearize_contact(
-            none.segments.in_world(data.world), data.world, variants, data.prepared.groups, none.errors
-        )
+        none, fits = candidate_fits(data.segments, data.world, fitted, groups)
+        at = linearize_contact(none.segments.in_world(data.world), data.world, variants, groups, none.errors)
         tries = {candidates[place].effect.name: count for place, count in tries_of(variants).items()}
+
+        def judged(
+            linear: Linearization, of: Callable[[CandidateFit], Linearization], first: Mapping[str, float]
+        ) -> list[Evidence]:
+            tests = _linear_tests(linear, candidates, variants)
+            tests += [tests[0].at(one, of(fits[one.name]), fits[one.name], tries[one.name]) for one in fitted]
+            return [replace(one, first_score=first[one.name]) for one in _ranked(tests, data)]
+
         first = {one.name: one.score for one in plain}
-        tests = _linear_tests(at.plain, candidates, variants)
-        tests += [tests[0].at(one, fits[one.name].plain, fits[one.name], tries[one.name]) for one in fitted]
-        plain = [replace(one, first_score=first[one.name]) for one in _ranked(tests, data)]
+        plain = judged(at.plain, lambda fit: fit.plain, first)
         if selected(self, plain, data):
             return plain
-        tests = _linear_tests(at.beside, candidates, variants)
-        tests += [tests[0].at(one, fits[one.name].beside, fits[one.name], tries[one.name]) for one in fitted]
-        beside = [replace(one, first_score=scores[one.name], beside_errors=True) for one in _ranked(tests, data)]
-        return beside if selected(self, beside, data) else plain
+        absent = linearize_contact(data.segments, data.world, variants, groups).beside
+        for one in _ranked(_linear_tests(absent, candidates, variants), data):
+            first[one.name] = max(one.score, first[one.name])
+        beside = judged(at.beside, lambda fit: fit.beside, first)
+        return [replace(one, beside_errors=True) for one in beside] if selected(self, beside, data) else plain
 
     def _is_likely(self, one: Evidence) -> bool:
         """Return whether a nameable effect of one parameter has a score where it is absent; then effects are fitted."""

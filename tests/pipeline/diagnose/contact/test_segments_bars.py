@@ -64,7 +64,7 @@ def test_effects_are_fitted_only_where_one_of_them_could_be_named(
     def fits(first: list[Evidence]) -> bool:
         with monkeypatch.context() as patch:
             patch.setattr(segments_module, "_linear_tests", lambda *_: [])
-            patch.setattr(segments_module, "linearize_contact", lambda *_: SimpleNamespace(plain=1, beside=1))
+            patch.setattr(segments_module, "linearize", lambda *_, **__: 1)
             patch.setattr(segments_module, "_ranked", lambda *_: first)
             patch.setattr(segments_module, "candidate_fits", lambda *_: fitted())
             try:
@@ -95,9 +95,9 @@ def test_what_the_law_alone_names_stands_and_beside_errors_of_impulses_more_is_n
         earlier={}, flown=False, explained=True, segments=segments, world=1, prepared=SimpleNamespace(groups=()),
         variants=lambda *_: [SimpleNamespace(active=evidence("adhesion").candidate)],
     )  # fmt: skip
-    monkeypatch.setattr(
-        segments_module, "linearize_contact", lambda *_: SimpleNamespace(plain="plain", beside="beside")
-    )
+    at = SimpleNamespace(plain="plain", beside="beside")
+    monkeypatch.setattr(segments_module, "linearize", lambda *_, **__: at.plain)
+    monkeypatch.setattr(segments_module, "linearize_contact", lambda *_: at)
     monkeypatch.setattr(segments_module, "_linear_tests", lambda linear, *_: [linear])
     monkeypatch.setattr(segments_module, "_ranked", lambda tests, _: lists[tests[0]])
     monkeypatch.setattr(segments_module, "_can_be_fitted", lambda _: False)
