@@ -107,10 +107,9 @@ class SlidingTest(ContactTest):
             return ()
         if data.sliding is not None and not _unexplained(data.sliding, self.limits.surplus_sigmas):
             return ()
-        if best.way_share is not None and best.way_share < self.limits.least_way:
-            return ()
-        if best.way_share is not None and data.sliding is not None and not _explained(best, data.sliding):
-            return ()
+        if best.way_share is not None and data.sliding is not None:
+            if best.way_share < self.limits.least_way or not _explained(best, data.sliding):
+                return ()
         parameters = len(best.candidate.effect.parameters)
         flexible = parameters > self.limits.few_parameters
         mapped = any(len(one.candidate.effect.parameters) > self.limits.many_parameters for one in equals)

@@ -202,24 +202,15 @@ def _basis(segments: Segments) -> Tensor:
         tangents = (axes * (size > 0.5).to(axes)[:, None])[..., 1:]  # of a groove the first of them is zero
         normal = normal[:, 0]
     if is_round(world.bodies[index]):
-        turns = torch.eye(3).to(normal).expand(count, 3, 3)
-        if seen.carried is not None:
-            return _unturned(tangents, turns)
+        spins = torch.eye(3).to(normal).expand(count, 3, 3)
     else:
-        turns = _in_body(seen.state.quat_wxyz[:, index], normal)[..., None]
-    size = turns.shape[-1]
-    basis = torch.zeros(count, STATE_SIZE, 4 + 2 * size).to(normal)
-    basis[:, 0:3, 0:2] = STATE_STEPS[0] * tangents
-    basis[:, 3:6, 2 : 2 + size] = STATE_STEPS[1] * turns
-    basis[:, 6:9, 2 + size : 4 + size] = STATE_STEPS[2] * tangents
-    basis[:, 9:12, 4 + size :] = STATE_STEPS[3] * turns
-    return basis
-
-
-def _unturned(tangents: Tensor, spins: Tensor) -> Tensor:
-    """Return changes of state (B, 12, 7) of a ball whose turns do not count, along tangents (B, 3, 2), and spins."""
-    basis = torch.zeros(len(tangents), STATE_SIZE, 7).to(tangents)
-    basis[:, 0:3, 0:2] = STATE_STEPS[0] * tangents
-    basis[:, 6:9, 2:4] = STATE_STEPS[2] * tangents
-    basis[:, 9:12, 4:] = STATE_STEPS[3] * spins
+        spins = _in_body(seen.state.quat_wxyz[:, index], normal)[..., None]
+    # the turns of a ball on fixed surfaces do not count
+    turns = spins[..., :0] if is_round(world.bodies[index]) and seen.carried is not None else spins
+    parts = [tangents.expand(count, 3, 2), turns, tangents.expand(count, 3, 2), spins]
+    basis = torch.zeros(count, STATE_SIZE, sum(part.shape[-1] for part in parts)).to(normal)
+    last = 0
+    for k, (part, step) in enumerate(zip(parts, STATE_STEPS, strict=True)):
+        first, last = last, last + part.shape[-1]
+        basis[:, 3 * k : 3 * k + 3, first:last] = step * part
     return basis

@@ -46,19 +46,15 @@ SIDE_S, SIDE_FRAMES = 0.04, 3
 
 
 def find_sliding_segments(world: World, whole: Observations, clear: Tensor, noise: Noise) -> list[Segment]:
-    """Return the sliding segments of whole episodes; none without a ground and surfaces, or with several bodies.
+    """Return the sliding segments of whole episodes; none without a ground or with several bodies.
 
     Args:
-        world: For shape and ground, or fixed surfaces.
+        world: For shape and ground.
         whole: The episodes (E).
         clear: Airborne frames (E, T).
         noise: Standard deviations of the tracks (position [m], rotation [rad]).
     """
-    if len(whole.free) != 1 or len(world.bodies) != 1:
-        return []
-    if on_surfaces(world):
-        return segments_on_surfaces(world, whole, clear, noise)[0]
-    if world.ground_normal is None:
+    if world.ground_normal is None or len(whole.free) != 1 or len(world.bodies) != 1:
         return []
     body = world.bodies[whole.free[0]]
     margin = LIMITS.near_m + LIMITS.near_sigmas * float(np.hypot(noise.position_m, noise.rotation_rad * size_of(body)))
@@ -237,19 +233,16 @@ def _impacts(
         asked: Which of these are asked for, shape (N,); the answer for others means nothing.
     """
     place = whole.position_m[:, :, 0].flatten(0, 1)[track.rows]
-    height = (place if normal is None else place @ normal).numpy()
+    heights = (place if normal is None else (place @ normal)[:, None]).numpy()
+    sigmas = LIMITS.kink_sigmas if normal is None else LIMITS.jump_sigmas
     quat, turned = whole.quat_wxyz[:, :, 0].flatten(0, 1)[track.rows], _turned(whole, track)
     level = torch.eye(3).to(place) if normal is None else tangent_axes(normal)[1:]
     jumps = np.zeros(len(track.times), np.bool_)
     for places, frames, t in track.windows(track.beside(asked)):
         inverse = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2, np.maximum(t, 0.0)], -1))[:, 3]
         spread = np.linalg.norm(inverse, axis=1)
-        if normal is None:
-            least = np.maximum(LIMITS.jump_m_s, LIMITS.kink_sigmas * noise.position_m * spread)
-            found = np.linalg.norm((inverse[..., None] * height[frames]).sum(1), axis=1) > least
-        else:
-            least = np.maximum(LIMITS.jump_m_s, LIMITS.jump_sigmas * noise.position_m * spread)
-            found = np.abs((inverse * height[frames]).sum(1)) > least
+        least = np.maximum(LIMITS.jump_m_s, sigmas * noise.position_m * spread)
+        found = np.linalg.norm((inverse[..., None] * heights[frames]).sum(1), axis=1) > least
         known = turned[frames].all(1)
         if not is_round(body) and known.any():  # an impact of a ball never changes its spin alone
             now = quat_conjugate(quat[torch.from_numpy(places)])[:, None]
