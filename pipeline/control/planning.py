@@ -88,11 +88,10 @@ class ControlState:
                 return f"{name} is not {size} finite numbers"
         if abs(np.linalg.norm(_numbers(self.quat_wxyz, 4)) - 1) > UNIT_TOLERANCE:
             return "quat_wxyz has not the length 1"
-        for what, given in (("position", self.joints or {}), ("speed", self.joint_speeds)):
-            wrong = [name for name in joints if given is not None and not math.isfinite(_number(given.get(name, 0.0)))]
-            missing = [name for name in joints if what == "position" and name not in (given or {})]
-            if wrong or missing:
-                return f"joint '{(wrong + missing)[0]}' has no finite {what}"
+        for what, given, missing in (("position", self.joints, math.nan), ("speed", self.joint_speeds, 0.0)):
+            wrong = [name for name in joints if not math.isfinite(_number((given or {}).get(name, missing)))]
+            if wrong:
+                return f"joint '{wrong[0]}' has no finite {what}"
         return "" if math.isfinite(_number(self.time_s)) else "time_s is not finite"
 
     def of(self, joints: Sequence[str]) -> ControlState:

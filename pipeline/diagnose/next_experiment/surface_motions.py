@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -76,12 +76,11 @@ def _starts(segments: Segments) -> State:
     seen, world = segments.observations, segments.world
     index, rows = seen.free[0], []
     motion = segments.positions()[:, :, 0]
-    first = segments.observations.state
     lengths = [float((motion[k, n - 1] - motion[k, 0]).norm()) for k, n in enumerate(segments.lengths)]
     for k in sorted(range(len(lengths)), key=lambda k: -lengths[k])[:3]:
         last = segments.lengths[k] - 1
         for frame, sign in ((0, 1.0), (last, -1.0)):
-            one = first.at(torch.tensor([k]))
+            one = seen.state.at(torch.tensor([k]))
             fields = [value.clone() for value in one.tensors]
             fields[0][:, index] = motion[k, frame]
             ahead = motion[k, min(frame + 3, last)] - motion[k, max(frame - 3, 0)]
@@ -99,14 +98,14 @@ def _starts(segments: Segments) -> State:
     return State.joined(*rows)
 
 
+@dataclass(frozen=True)
 class _Misfits:
     """What rivals leave of motions (K)."""
 
-    def __init__(self, misfit: Tensor, duration_s: list[float]) -> None:
-        self.misfit = misfit
-        """Chi2 by rival and motion, shape (R, K)."""
-        self.duration_s = duration_s
-        """Time [s] until each leaves the surfaces or meets a wall (K)."""
+    misfit: Tensor
+    """Chi2 by rival and motion, shape (R, K)."""
+    duration_s: list[float]
+    """Time [s] until each leaves the surfaces or meets a wall (K)."""
 
 
 class _Compared:
@@ -186,7 +185,7 @@ def _words(starts: State, item: int, index: int, ball: bool) -> str:
     speed = float(velocity.norm())
     if speed == 0:
         return f"let it go from rest at ({place}) cm"
-    way = ", ".join(f"{x + 0.0:.1f}" for x in (velocity / max(speed, 1e-9)).tolist())
+    way = ", ".join(f"{x + 0.0:.1f}" for x in (velocity / speed).tolist())
     rising = float(velocity[2]) > math.sin(math.radians(1)) * speed
     verb = "roll" if ball else "slide"
     return f"{verb} it {'up' if rising else 'on'} from ({place}) cm at {speed:.1f} m/s along ({way})"
