@@ -96,7 +96,7 @@ class PhysConfig(FileModel):
     """Whether the colliding spheres that touch are refined with the images, through the motion alone; left out, only
     under the paper's law, whose published form it is."""
     contact_law: Literal["closed_form", "paper"] = "closed_form"
-    """Law of contact that is fitted: ours, or the ContactGaussian-WM paper's, which the torch engine alone has."""
+    """Law of contact that is fitted: ours, or the ContactGaussian-WM paper's."""
     effects: tuple[str, ...] = ()
     """Effects to add to the model and to fit: names of built-in ones, or `path/to/file.py:ClassName`."""
     mass_distribution: bool | Literal["auto"] = "auto"

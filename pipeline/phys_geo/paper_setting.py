@@ -1,20 +1,16 @@
-"""The setting `phys-geo.contact_law=paper`: what a fit of that law does not take, and its cost."""
+"""The setting `phys-geo.contact_law=paper`: what a fit of that law does not take."""
 
 from __future__ import annotations
 
 from ...datasets.capture.capture import Capture
-from ...datasets.io.progress import note
 from ...datasets.models.joints import refuse_joints
 from ...schemas import ModelFile, PhysConfig, UsageError
 
-SLOWER = 20
-"""How many times longer a fit of the paper's law to a track takes on a CPU, since the kernels do not have it: 48 s
-against 2.4 s for a box that falls once."""
 _PARTS = ("mass_distribution", "length_scale")
 
 
 def paper_config(file: ModelFile, capture: Capture, config: PhysConfig) -> PhysConfig:
-    """Return the settings of a fit of the paper's law, and say what it costs.
+    """Return the settings of a fit of the paper's law.
 
     Mass distribution and scale are not chosen by windows about impacts, which assume our law; contact spheres are
     refined as published, unless the setting `geometry` says no.
@@ -40,8 +36,5 @@ def paper_config(file: ModelFile, capture: Capture, config: PhysConfig) -> PhysC
             "the paper's law alone.",
             "leave out one of the two, or use phys-geo.contact_law=closed_form.",
         )
-    note(
-        f"phys-geo: the contact law 'paper' runs in the torch engine alone, some {SLOWER} times slower than the kernels"
-    )
     refined = config.geometry is not False
     return config.model_copy(update={**dict.fromkeys(_PARTS, False), "geometry": refined})

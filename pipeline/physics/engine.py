@@ -19,6 +19,7 @@ from .contact_detection import pairs_of, slot_count
 from .fused import simulate_fused, unsupported
 from .fused.host import lacking, simulate_on_host
 from .kinematic import Drive
+from .paper_law import PaperLaw
 from .rollout import Rollout, simulate
 from .state import State
 from .world import World
@@ -146,9 +147,11 @@ def lacking_derivatives(
     driven: Mapping[str, Track | Drive | JointCommand],
     record_contacts: bool,
 ) -> str | None:
-    """Return the requested derivatives that the kernel does not support, in words; None for none."""
+    """Return the requested derivatives or labels that the kernel does not support, in words; None for none."""
     if not torch.is_grad_enabled() and not record_contacts:
         return None
+    if record_contacts and isinstance(world.contact, PaperLaw):
+        return f"the contact record of the law '{world.contact.name}' is asked for"
     tensors = list(_tensors(world, state, times_s, driven))
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return "derivatives in reverse are asked for"

@@ -5,6 +5,9 @@ to 5). One explicit evaluation of polyhedral rows n - mu d on every contact, sti
 
     lambda = SoftPlus(-K (h J b + phi) - D J b),    v = b + h M^-1 J^T lambda
 
+A row acts where the gap of its contact is closed, or closes within the step: of a gap that is open, damping would brake
+a body on its way, and SoftPlus push it.
+
 Differences from the default law: the stiffness grows with the number of touching spheres, the restitution depends on
 the step, bodies creep on slopes on which friction should hold them, and a sliding body floats higher than one at rest.
 
@@ -160,5 +163,7 @@ def paper_impulses(law: PaperLaw, touch: Touch, axes: Tensor) -> Tensor:
     h, stiffness, damping = touch.step_s[..., None], law.stiffness_n_m[:, None, None], law.damping_n_s_m[:, None, None]
     force = -stiffness * (h * along + gap[..., None]) - damping * along
     force = force.clamp_min(0.0) if math.isinf(law.softplus_per_n) else softplus(force, law.softplus_per_n)
-    impulse = h * force
+    ahead = touch.gap + touch.step_s * free[..., 0]
+    closed = (touch.gap < 0) | (ahead < 0)
+    impulse = torch.where(closed[..., None], h * force, torch.zeros_like(force))
     return torch.cat((impulse.sum(-1, keepdim=True), -touch.friction[..., None] * (impulse @ facets)), -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -16,6 +17,7 @@ from ..contact_detection import GROUND, edge_slots, pairs_of, slot_count
 from ..contact_law import ContactLaw, coefficients
 from ..kinematic import Drive
 from ..pair_laws import laws_in_use
+from ..paper_law import PaperLaw
 from ..rigid_body import start
 from ..rollout import rows_of_times
 from ..state import State
@@ -142,7 +144,7 @@ def _paced(world: World, times_s: Tensor) -> tuple[Tensor, Tensor]:
     """Return `Packed.steps` and `Packed.substeps`."""
     times = times_s if times_s.ndim == 2 else times_s[None]
     counts = torch.tensor(world.substeps(times), dtype=torch.int32, device=times.device)
-    return _steps(world.once(wrenches.closed_forms), times, counts), counts
+    return _steps(world.once(laws_in_use).laws, times, counts), counts
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,8 @@ def _fixed(world: World) -> _Fixed:
     surfaces = [_surface(surface, turn) for surface in world.surfaces]
     listed, lowest = _listed_spheres(world)
     effects, meshes = wrenches.coefficients(world), packed_meshes(world.surfaces)
-    turned = turn is not None and (len(world.bodies) > 1 or bool(world.surfaces))
+    published = isinstance(world.contact, PaperLaw)  # the directions of its rows are chosen in the world's frame
+    turned = turn is not None and (published or len(world.bodies) > 1 or bool(world.surfaces))
     return _Fixed(
         turn=turn,
         effects=effects,
@@ -235,13 +238,14 @@ def _structure(
         spheres=tuple(body.radii.shape[-1] for body in world.bodies),
         pairs=tuple((a, b, slot_count(world, (a, b))) for a, b in pairs_of(world)),
         laws=_law_numbers(world),
-        hulls=_hulls(world),
-        areas=_area_starts(world),
+        hulls=() if isinstance(world.contact, PaperLaw) else _hulls(world),
+        areas=() if isinstance(world.contact, PaperLaw) else _area_starts(world),
         lowest=lowest,
         surfaces=tuple(surface.kind for surface in world.surfaces),
         mesh_starts=mesh_starts,
         surface=wrenches.has_surface(world),
         elliptic=wrenches.has_ellipse(world),
+        published=world.contact.directions if isinstance(world.contact, PaperLaw) else 0,
     )
 
 
@@ -269,7 +273,7 @@ def _hull_size(faces: int, edges: int, supports: int, ridges: int) -> int:
     return 3 * faces + edges + supports + 3 * (ridges + _PLANES * -(-faces // _PLANES))
 
 
-def _steps(laws: Sequence[ContactLaw], times: Tensor, substeps: Tensor) -> Tensor:
+def _steps(laws: Sequence[ContactLaw | PaperLaw], times: Tensor, substeps: Tensor) -> Tensor:
     """Return the rows of `Packed.steps` (1 or B, intervals, 2 + 2 laws); one row where there is no interval."""
     if times.shape[1] == 1:
         zero = torch.zeros_like(times)
@@ -281,7 +285,11 @@ def _steps(laws: Sequence[ContactLaw], times: Tensor, substeps: Tensor) -> Tenso
     )
     times = rows_of_times(times, max(len(time), len(ratio)))
     h = times.diff(dim=1) / substeps
-    each = torch.stack(coefficients(time, ratio, h[..., None]), -1)
+    if isinstance(laws[0], PaperLaw):
+        numbers = torch.broadcast_tensors(laws[0].stiffness_n_m, laws[0].damping_n_s_m)
+        each = torch.stack(numbers, -1)[:, None, None].expand(-1, h.shape[1], -1, -1)
+    else:
+        each = torch.stack(coefficients(time, ratio, h[..., None]), -1)
     parts = (h[..., None], each[..., 0, :], times[:, :-1, None], each[..., 1:, :].flatten(-2))
     batch = max(map(len, parts))
     return torch.cat([part.expand(batch, -1, -1) for part in parts], -1)
@@ -292,9 +300,11 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
     zero = torch.zeros_like(world.gravity[:, :1])
     offset = zero if world.ground_offset is None else world.ground_offset[:, None]
     columns = [in_frame(turn, world.gravity), offset]
-    columns += [law.friction[:, None] for law in world.once(wrenches.closed_forms)]
+    columns += [law.friction[:, None] for law in world.once(laws_in_use).laws]
     if turned and turn is not None:
         columns.append(turn[None])
+    if isinstance(world.contact, PaperLaw):
+        columns.append(zero.new_tensor([_published_numbers(world.contact)]))
     columns += [in_frame(turn, effect) if effect.shape[-1] == 3 else effect for effect in effects]
     columns += tree.columns(world, state)
     groups = world.once(_groups)
@@ -305,6 +315,13 @@ def _columns(world: World, state: State, turn: Tensor | None, turned: bool, effe
         else:
             columns.append(others[:, rows[0] : rows[-1] + 1].flatten(1))
     return columns
+
+
+def _published_numbers(law: PaperLaw) -> list[float]:
+    """Return the numbers of `Published` in `kernels/environment.cuh`; 0 for none."""
+    soft = 0.0 if math.isinf(law.softplus_per_n) else law.softplus_per_n
+    clamp = (law.clamp_depth_m or 0.0, law.clamp_per_m or 0.0, law.zero_m)
+    return [soft, law.sharpness_per_m or 0.0, *clamp]
 
 
 def _groups(world: World) -> list[tuple[bool, list[int]]]:

@@ -18,6 +18,7 @@ from ..checks import require_physical, require_state
 from ..contact_record import ContactRecord
 from ..effects.effect import changed_by_effects
 from ..kinematic import Drive
+from ..paper_law import PaperLaw
 from ..rollout import Rollout
 from ..state import State
 from ..world import World
@@ -115,6 +116,12 @@ def roll(
     if changed is not world:
         require_physical(changed)  # an effect may give a body an impossible inertia
     world = changed
+    if record_contacts and isinstance(world.contact, PaperLaw):
+        raise UsageError(
+            f"the fused kernel has no contact record of the law '{world.contact.name}'.",
+            "record_contacts=False.",
+            todo="use simulate, which has one.",
+        )
     packed = pack(world, state, times_s, driven or {}, record_contacts)
     values, tangents = _values_and_tangents(packed.table, packed.steps, packed.geometry, packed.surfaces, packed.drives)
     dual = any(tangent is not None for tangent in tangents)

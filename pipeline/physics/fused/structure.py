@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -26,7 +27,7 @@ GATHERED_THREADS = 256
 CROWDS = (256, 128, 64)
 """Largest numbers of contacts at once for which such a block has room; the first that fits into its memory."""
 BODY_COLUMNS, WRENCH_COLUMNS, TWIST_COLUMNS, LIFT_COLUMNS, MAGNET_COLUMNS, SURFACE_COLUMNS = 23, 10, 3, 3, 2, 22
-TURN_COLUMNS, WORLD_COLUMNS = 4, 5
+TURN_COLUMNS, WORLD_COLUMNS, PUBLISHED_COLUMNS = 4, 5, 5
 """Columns of the table of environments, by subject, as `load` in `kernels/environment.cuh` reads them; each further
 contact law adds one to those of the world."""
 MOTION_COLUMNS = 13
@@ -75,8 +76,8 @@ _NUMBERS: dict[str, float] = {
 
 _WIDTHS = {
     "BODY_COLUMNS": BODY_COLUMNS, "MOTION_COLUMNS": MOTION_COLUMNS, "LINK_COLUMNS": LINK_COLUMNS,
-    "JOINT_COLUMNS": JOINT_COLUMNS, "SAMPLE_WIDTH": COMMAND_WIDTH, "FRAME_WIDTH": FRAME_WIDTH,
-    "LABEL_WIDTH": LABEL_WIDTH, "SURFACE_WIDTH": SURFACE_WIDTH,
+    "JOINT_COLUMNS": JOINT_COLUMNS, "PUBLISHED_COLUMNS": PUBLISHED_COLUMNS, "SAMPLE_WIDTH": COMMAND_WIDTH,
+    "FRAME_WIDTH": FRAME_WIDTH, "LABEL_WIDTH": LABEL_WIDTH, "SURFACE_WIDTH": SURFACE_WIDTH,
 }  # fmt: skip
 """Numbers of a row of the kernels' arrays: of 64 bits there, as products with them may need."""
 
@@ -102,6 +103,7 @@ _FILES = (
     "sweeps",  # iterations over impulses
     "collision",  # all contacts of a step
     "gathered",  # contacts of an environment that a block of threads simulates
+    "published",  # all contacts of a step by the paper's law
     "rollout",  # an environment from its first frame to its last, and what is written of it
 )
 """Files of `kernels/` in the order in which they are compiled, after `language`; each names its formulas' origin."""
@@ -156,6 +158,8 @@ class Structure:
     """Whether effects act on the contact of one body with the ground."""
     elliptic: bool = False
     """Whether friction depends on the direction."""
+    published: int = 0
+    """Number of rows of a contact's friction pyramid by the paper's law; 0 for ours."""
     tree: Tree | None = None
     """Links of chains; None for none."""
     crowd: int = 0
@@ -291,7 +295,7 @@ class Structure:
         world = WORLD_COLUMNS + self.law_count - 1 + self.turned * TURN_COLUMNS
         world += self.effects * WRENCH_COLUMNS + self.twisted * TWIST_COLUMNS + self.magnets * MAGNET_COLUMNS
         world += self.lifted * LIFT_COLUMNS
-        world += self.surface * SURFACE_COLUMNS
+        world += self.surface * SURFACE_COLUMNS + bool(self.published) * PUBLISHED_COLUMNS
         if self.tree is not None:
             world += self.tree.table_width
         return world + len(self.free) * BODY_COLUMNS
@@ -327,7 +331,9 @@ class Structure:
     def widens(self) -> bool:
         """Whether a CPU can simulate several environments in one vector: one free body above the ground, no records."""
         alone = self.free == (True,) and not self.paired and self.tree is None and set(self.drives) == {-1}
-        plain = not (self.single or self.dual or self.record or self.carried or self.areas or self.turned)
+        plain = not (
+            self.single or self.dual or self.record or self.carried or self.areas or self.turned or self.published
+        )
         return alone and plain and self.lanes == 1 and self.contacts <= _MOST_WIDE
 
     def source(self, host: bool = False, wide: int = 0) -> str:
@@ -346,6 +352,7 @@ class Structure:
         else:
             lists = listed(tree.lists | self._long_lists())
         functions = [_function(name, values) for name, values in self._called_lists().items()]
+        functions += _facets(self.published)
         numbers += [f"#define {name} {value}LL" for name, value in _WIDTHS.items()]
         texts = (kernel_file("language"), *lists, *functions, *map(kernel_file, _FILES))
         return "\n".join((*flags, *numbers, *texts))
@@ -368,7 +375,7 @@ class Structure:
         paired = self.paired
         alone = host and self.lanes == 1  # one thread of a CPU, whose arrays lie in its cache
         hulls = self.hulled
-        held = not paired and (alone or self._fits_registers)
+        held = not paired and not self.published and (alone or self._fits_registers)
         queued = self.shared and not hulls
         gathered = self.gathered
         # contacts with ground and surfaces may be two more of a pair than the even share of a lane
@@ -378,7 +385,7 @@ class Structure:
             "DUAL": self.dual, "LANES": self.lanes, "SLOTS": self.slots,
             "RECORD": self.record, "EFFECTS": self.effects, "MAGNETS": self.magnets,
             "TWISTED": self.twisted, "LIFTED": self.lifted, "SURFACE": self.surface, "ELLIPTIC": self.elliptic,
-            "TURNED": self.turned,
+            "TURNED": self.turned, "PUBLISHED": self.published,
             "BODIES": len(self.free), "FREES": max(1, sum(self.free)) if self.shared else len(self.free),
             "PAIRS": len(self.pairs), "FIXED": len(self.surfaces),
             "MESHES": self.surfaces.count(MESH), "MESH_CONTACTS": MESH_CONTACTS,
@@ -459,9 +466,19 @@ def _starts(counts: Sequence[int]) -> list[int]:
     return [sum(counts[:index]) for index in range(len(counts))]
 
 
+def _facets(count: int) -> list[str]:
+    """Return the source of the directions of the rows of a friction pyramid, along both tangents."""
+    turns = [2 * math.pi * row / count for row in range(count)]
+    axes = {"facet_x": map(math.cos, turns), "facet_y": map(math.sin, turns)}
+    return [f"INLINE double {name}(int i) {{ return {_cases(values)}0; }}" for name, values in axes.items()]
+
+
+def _cases(values: Iterable[float]) -> str:
+    return "".join(f"i == {index} ? {value!r} : " for index, value in enumerate(values))
+
+
 def _function(name: str, values: Sequence[int]) -> str:
     """Return the source of a function that looks up a list, which the compiler resolves for a known index."""
     if len(values) > _LONG_LIST:
         return f"INLINE int {name}(int i) {{ return {name}_of[i]; }}"
-    cases = "".join(f"i == {index} ? {int(value)} : " for index, value in enumerate(values))
-    return f"INLINE int {name}(int i) {{ return {cases}0; }}"
+    return f"INLINE int {name}(int i) {{ return {_cases(map(int, values))}0; }}"

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ....schemas import UsageError
 from ..contact_law import ContactLaw
 from ..effects.adhesion import Adhesion
 from ..effects.anisotropic_friction import AnisotropicFriction
@@ -29,6 +28,7 @@ from ..effects.velocity_restitution import VelocityRestitution
 from ..effects.viscous_friction import ViscousFriction
 from ..effects.wind import Wind
 from ..pair_laws import laws_in_use
+from ..paper_law import PaperLaw
 from ..world import World
 
 _KNOWN = (
@@ -52,9 +52,9 @@ _SURFACE = (
 
 def reason_against(world: World) -> str | None:
     """Return the part of a world's contact law or effects that the kernel lacks, in words; None where it has all."""
-    if not isinstance(world.contact, ContactLaw):
-        return _no_law(world)
     acting = [active.effect for active in world.effects if _acts(active.effect)]
+    if not isinstance(world.contact, ContactLaw):
+        return _against_published(world, world.contact, acting)
     for effect in acting:
         if type(effect) not in (*_KNOWN, *_SURFACE):  # a user's subclass of a known one is another effect
             return f"the kernel does not have its effect '{effect.name}'"
@@ -68,21 +68,16 @@ def reason_against(world: World) -> str | None:
     return _against_surface(world, acting)
 
 
-def closed_forms(world: World) -> list[ContactLaw]:
-    """Return the contact laws in use of a world that the kernel supports.
-
-    Raises:
-        UsageError: If the world has another contact law.
-    """
-    laws = laws_in_use(world).laws
-    found = [law for law in laws if isinstance(law, ContactLaw)]
-    if len(found) < len(laws):
-        raise UsageError(f"{_no_law(world)}.", todo="use simulate, which can.")
-    return found
-
-
-def _no_law(world: World) -> str:
-    return f"the kernel does not have its contact law '{world.contact.name}'"
+def _against_published(world: World, law: PaperLaw, acting: Sequence[Effect]) -> str | None:
+    """Return why the kernel does not support a world with the paper's law; None where it does."""
+    if world.pair_laws or world.chains or world.surfaces:
+        beside = "other laws" if world.pair_laws else "chains" if world.chains else "fixed surfaces"
+        return f"the kernel does not have the contact law '{law.name}' beside {beside}"
+    if acting:
+        return f"the kernel does not have the contact law '{law.name}' with the effect '{acting[0].name}'"
+    if law.sharpness_per_m is None and len(world.bodies) > 1:
+        return f"the kernel has the contact law '{law.name}' between bodies with a sharpness of their distance alone"
+    return None
 
 
 def _against_surface(world: World, acting: Sequence[Effect]) -> str | None:
@@ -182,7 +177,7 @@ def coefficients(world: World) -> list[Tensor]:
 
 def _surface(world: World, zero: Tensor) -> list[Tensor]:
     """Return the columns (1 or B, 1) of `Surface`; lengths and speeds of effects that do not act are 1."""
-    law = closed_forms(world)[0]  # the surface is that of one body on the ground
+    law = laws_in_use(world).laws[0]  # the surface is that of one body on the ground
     values: dict[type[Effect], Values] = {type(active.effect): active.values for active in world.effects}
 
     def number(kind: type[Effect], name: str, otherwise: float = 0.0) -> Tensor:

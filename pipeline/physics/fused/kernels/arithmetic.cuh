@@ -17,6 +17,10 @@ __device__ inline float greater(float a, float b) { return a > b ? a : b; }
 __device__ inline double greater(double a, double b) { return a > b ? a : b; }
 __device__ inline float exponential(float x) { return expf(x); }
 __device__ inline double exponential(double x) { return exp(x); }
+__device__ inline float logarithm(float x) { return logf(x); }
+__device__ inline double logarithm(double x) { return log(x); }
+__device__ inline float log_of_one_and(float x) { return log1pf(x); }
+__device__ inline double log_of_one_and(double x) { return log1p(x); }
 __device__ inline double reciprocal(double x) { return 1.0 / x; }
 __device__ inline double root(double x) { return sqrt(x); }
 #if HOST
@@ -92,6 +96,9 @@ template <class T> __device__ inline Dual<T> root(Dual<T> x) {
 template <class T> __device__ inline Dual<T> exponential(Dual<T> x) {
     T value = exponential(x.value);
     return Dual<T>(value, x.tangent * value);
+}
+template <class T> __device__ inline Dual<T> logarithm(Dual<T> x) {
+    return Dual<T>(logarithm(x.value), x.tangent * reciprocal(x.value));
 }
 template <class T> __device__ inline void sine_cosine(Dual<T> x, Dual<T>& s, Dual<T>& c) {
     sine_cosine(x.value, s.value, c.value);

@@ -135,7 +135,7 @@ INLINE void find_near_pairs(const Problem& problem, Environment& env, const Lane
 }
 #endif
 
-#if !GATHERED
+#if !GATHERED && !PUBLISHED
 // Finds the contacts of a step and their impulses, and adds these to the bodies' velocities and angular momenta.
 INLINE void collide(const Problem& problem, Environment& env, Own& own, const Mat* rotations, Motion* motions,
                     Vec* velocities, Vec* spins) {

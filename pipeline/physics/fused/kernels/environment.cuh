@@ -2,8 +2,8 @@
 // What the kernel is given; units are m, kg, s and rad. `Packed` in `packing.py` says more.
 struct Problem {
     Input table;     // (environments, TABLE_WIDTH): numbers of each environment, in the order in which `load` reads
-    Input steps;     // (1 or environments, intervals, STEP_WIDTH): step, stiffness and damping (without unit), time at the
-                     // start; then stiffness and damping of each further law
+    Input steps;     // (1 or environments, intervals, STEP_WIDTH): step, stiffness and damping (without unit; of the
+                     // paper's law with), time at the start; then stiffness and damping of each further law
     Input geometry;  // (1 or environments, spheres, 4): centres in the body frame, radii
     Input surfaces;  // (1 or environments, FIXED, SURFACE_WIDTH): position, quaternion, size
     Input drives;    // (1 or environments, samples, SAMPLE_WIDTH): time, position, quaternion, velocity, angular velocity
@@ -113,12 +113,21 @@ struct StepRoom {
 };
 #endif
 
+#if PUBLISHED
+struct Published {  // numbers of the paper's law that its contacts have in common; 0 for none
+    Number softplus_per_n, sharpness_per_m, clamp_depth_m, clamp_per_m, zero_m;
+};
+#endif
+
 struct Common {  // what the lanes of an environment have in common
     Place index, geometry, steps, drives, surfaces;
     int drive_last;
     Vec gravity;
     Real ground;
     Law laws[LAWS];
+#if PUBLISHED
+    Published published;
+#endif
 #if EFFECTS
     Wrenches wrenches;
 #endif
@@ -180,6 +189,10 @@ INLINE void load(const Problem& problem, Environment& env, Own& own) {
     Quat turn = {table.at(at), table.at(at + 1), table.at(at + 2), table.at(at + 3)};
     env.turn = matrix(turn);
     at += 4;
+#endif
+#if PUBLISHED
+    Number* const numbers = &env.published.softplus_per_n;
+    for (int i = 0; i < PUBLISHED_COLUMNS; i++) numbers[i] = plain(table.at(at++));
 #endif
 #if EFFECTS
     Wrenches& w = env.wrenches;

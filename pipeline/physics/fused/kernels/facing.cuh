@@ -1,5 +1,5 @@
 // Gap, normal and point of each possible contact of two bodies; formulas of `physics/contact_detection.py`.
-#if PAIRED
+#if PAIRED || PUBLISHED
 // Two unit tangents of a contact, orthogonal to its normal, chosen in the world frame.
 INLINE void tangents(const Environment& env, Vec normal, Vec& first, Vec& second) {
 #if TURNED
@@ -16,7 +16,9 @@ INLINE void tangents(const Environment& env, Vec normal, Vec& first, Vec& second
     second = env.turn * second;
 #endif
 }
+#endif
 
+#if PAIRED
 struct Facing {
     Vec normal, point;  // world frame; the normal points from body b of the pair to body a
     Real gap;

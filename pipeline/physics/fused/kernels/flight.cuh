@@ -1,14 +1,19 @@
 // Bodies without contact: effects in flight, and the motion over a step; formulas of `physics/rigid_body.py` and
 // `physics/effects`.
 // Moves a free body over one step, given velocity and angular momentum at its end: the position is advanced by the mean
-// velocity, the rotation by the angular velocity of the mean angular momentum at the midpoint.
+// velocity, the rotation by the angular velocity of the mean angular momentum at the midpoint; by the paper's law (PUBLISHED)
+// both by those at the end.
 INLINE void advance(Body& body, const Weight& c, Vec omega_start, Vec velocity, Vec spin, Real h) {
     Real half_h = Number(0.5) * h;
     Quat half = normalized(multiply(body.quat, quat_exp(half_h * omega_start)));
-    Vec mean = Real(Number(0.5)) * (body.spin + spin);
+#if PUBLISHED
+    const Vec mean = spin, way = h * velocity;
+#else
+    const Vec mean = Real(Number(0.5)) * (body.spin + spin), way = half_h * (body.velocity + velocity);
+#endif
     Vec omega = c.inverse_inertia * transposed(matrix(half), mean);
     body.quat = normalized(multiply(body.quat, quat_exp(h * omega)));
-    body.position = body.position + half_h * (body.velocity + velocity);
+    body.position = body.position + way;
     body.velocity = velocity;
     body.spin = spin;
 }

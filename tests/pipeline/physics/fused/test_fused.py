@@ -14,7 +14,7 @@ import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.geometry.rotation import quat_exp, quat_multiply, quat_rotate
 from cgwm.pipeline.optimization.forward_mode import batched_jacobian
-from cgwm.pipeline.physics import Body, ContactLaw, PaperLaw, Rollout, State, World, engine, simulate
+from cgwm.pipeline.physics import Body, ContactLaw, Rollout, State, World, engine, simulate
 from cgwm.pipeline.physics.devices import on_device
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.linear_drag import LinearDrag
@@ -727,8 +727,6 @@ def test_what_the_kernel_does_not_have() -> None:
     assert "'other'" in (reason_against(replace(world, effects=(ActiveEffect.of(Other()),))) or "")
     flying = replace(world, touching=False, effects=(active("adhesion", F=1.0),))
     assert "do not touch anything" in (reason_against(flying) or "")
-    published = PaperLaw.of_rows(batch(0.3), batch(1e4), batch(10.0))
-    assert "'published'" in (reason_against(replace(world, contact=published)) or "")
     assert "its bodies may have 16392 contacts" in (reason_against(crowded(8188)) or "")
 
 

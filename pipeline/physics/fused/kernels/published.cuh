@@ -1,0 +1,196 @@
+// Contacts by the paper's law: one explicit evaluation of the rows of a friction pyramid on every contact that is closed;
+// formulas of `physics/paper_law.py`, distances of `physics/smooth_distance.py`.
+#if PUBLISHED
+const double NEGLIGIBLE = 40;  // exponent: exp(-40) is less than rounding
+const double LINEAR = 20;      // exponent from which SoftPlus is taken as its argument, as in torch
+
+// The soft maximum of a force and 0; the plain one where it has no sharpness.
+INLINE Real softened(Real force, Number sharpness) {
+    if (!(sharpness > Number(0))) return at_least(force, Number(0));
+    const Number exponent = sharpness * plain(force);
+    if (exponent > Number(LINEAR)) return force;
+    if (exponent < Number(-NEGLIGIBLE)) return Real(0);
+    const Number power = exponential(exponent), soft = quotient(log_of_one_and(power), sharpness);
+#if DUAL
+    return Real(soft, force.tangent * quotient(power, Number(1) + power));
+#else
+    return soft;
+#endif
+}
+
+// The published clamp of a distance; the distance itself where it has none.
+INLINE Real clamped(const Published& p, Real gap) {
+    if (!(p.clamp_per_m > Number(0))) return gap;
+    const Real far = gap + Real(p.zero_m);
+    const Real inside = reciprocal(Real(1) + exponential(-(p.clamp_per_m * far)));
+    return inside * (far + Real(p.clamp_depth_m)) - Real(p.clamp_depth_m);
+}
+
+// The impulse of a contact, given its gap, the speed at which the gap widens and the slip along its tangents; along the
+// normal, then the tangents.
+INLINE Vec pushed(const Published& p, const Law& law, Real gap, Real speed, Real one, Real two) {
+    Vec sum = none();
+    const Real distance = clamped(p, gap);
+    SPREAD
+    for (int d = 0; d < PUBLISHED; d++) {
+        const Real along = speed - law.friction * (Number(facet_x(d)) * one + Number(facet_y(d)) * two);
+        const Real force = -(law.stiffness * (law.step_s * along + distance)) - law.damping * along;
+        const Real impulse = law.step_s * softened(force, p.softplus_per_n);
+        sum.x += impulse;
+        sum.y -= Number(facet_x(d)) * impulse;
+        sum.z -= Number(facet_y(d)) * impulse;
+    }
+    sum.y = law.friction * sum.y;
+    sum.z = law.friction * sum.z;
+    return sum;
+}
+
+// Whether a contact acts: its gap is closed, or closes within the step.
+INLINE bool acts(const Law& law, Real gap, Real speed) {
+    return plain(gap) < Number(0) || plain(gap) + plain(law.step_s) * plain(speed) < Number(0);
+}
+
+struct Acting {  // impulse of the contacts of a pair on a, and its moments about both centres of mass
+    Vec linear, angular_a, angular_b;
+};
+
+// Adds the impulses of a body's spheres with the ground.
+INLINE void push_ground(const Problem& problem, const Environment& env, const Own& own, int p, const Mat& rotation,
+                        const Motion& m, Acting& sum) {
+    const int a = pair_a(p), start = contact_start(p);
+    const Law& law = env.laws[0];
+    const Real height = env.bodies[a].position.z - env.ground;
+    const Vec up = vec(Real(0), Real(0), Real(1));
+    Vec one, two;
+    tangents(env, up, one, two);
+    // no point of the body sinks further in this step, up to rounding
+    const Number fall = size(m.velocity) + size(m.omega) * env.constants[a].reach;
+    const Number far = plain(law.step_s) * fall + Number(1e-6);
+    EACH_OWNED(own.lanes, start, contact_count(p), k) {
+        const Place row = env.geometry + 4LL * problem.spheres[start + k];
+        const Vec held = problem.geometry.vector(row) - env.constants[a].com;
+        const Real radius = problem.geometry.at(row + 3);
+        if (plain(height) + plain(dot(rotation.z, held)) - plain(radius) > far) continue;
+        Vec arm = rotation * held;
+        arm.z = arm.z - radius;
+        const Real gap = height + arm.z;
+        const Vec velocity = m.velocity + cross(m.omega, arm);
+        if (!acts(law, gap, velocity.z)) continue;
+        const Vec along = pushed(env.published, law, gap, velocity.z, dot(velocity, one), dot(velocity, two));
+        const Vec impulse = along.x * up + along.y * one + along.z * two;
+        sum.linear = sum.linear + impulse;
+        sum.angular_a = sum.angular_a + cross(arm, impulse);
+    }
+}
+
+#if PAIRED
+// Bound on how far the smooth distance from a body lies below that of its nearest sphere.
+INLINE Number softness(const Published& p, int b) {
+    return quotient(logarithm(Number(sphere_count(b))), p.sharpness_per_m);
+}
+
+// Distance of a point from the spheres of a body by the logarithm of a sum of exponentials, and the outward normal, all
+// in the frame of that body. Where the normal is undefined it is `up`. Returns whether the distance may be below `limit`.
+INLINE bool soft_distance(const Published& p, const Union& spheres, Vec at, Number limit, Vec up, Real& distance,
+                          Vec& outward) {
+    const Number point[3] = {plain(at.x), plain(at.y), plain(at.z)}, width = quotient(Number(NEGLIGIBLE), p.sharpness_per_m);
+    const Number nearest = nearest_in(spheres, point);
+    if (nearest - quotient(logarithm(Number(spheres.count)), p.sharpness_per_m) > limit) return false;
+    Real total = Real(0);
+    Vec gradient = none();
+    KEEP_LOOP
+    for (int i = 0; i < spheres.count; i++) {
+        if (!below(square_to(spheres, i, point), plain_radius(spheres, i), nearest + width)) continue;
+        const Vec away = at - spheres.center(i);
+        const Real length = root(dot(away, away));
+        const Real power = exponential(-(p.sharpness_per_m * (length - spheres.radius(i) - Real(nearest))));
+        total += power;
+        gradient = gradient + power * reciprocal(at_least(length, Number(1e-12))) * away;
+    }
+    distance = Real(nearest) - quotient(Number(1), p.sharpness_per_m) * logarithm(total);
+    gradient = reciprocal(total) * gradient;
+    const Real norm2 = dot(gradient, gradient);
+    outward = plain(norm2) > Number(1e-16) ? inverse_root(norm2) * gradient : up;
+    return true;
+}
+
+// Adds the impulses between two bodies: of the spheres of b with the union of a, then of those of a with that of b.
+INLINE void push_pair(const Problem& problem, const Environment& env, const Own& own, int p, const Mat* rotations,
+                      const Motion* motions, Acting& sum) {
+    const int a = pair_a(p), b = pair_b(p), of_b = sphere_count(b);
+    const Law& law = env.laws[0];
+    const Constants &ca = env.constants[a], &cb = env.constants[b];
+    const Motion &ma = motions[a], &mb = motions[b];
+    const Number soft = greater(softness(env.published, a), softness(env.published, b)), h = plain(law.step_s);
+    // points at a gap g approach at V + W g / 2 at most, so those beyond h V / (1 - h W / 2) cannot touch in this step
+    const Number spin_a = size(ma.omega), spin_b = size(mb.omega), left = Number(1) - Number(0.5) * h * (spin_a + spin_b);
+    const Number V = size(ma.velocity - mb.velocity) + spin_a * (ca.reach + soft) + spin_b * (cb.reach + soft);
+    const Number limit = left > Number(0.01) ? quotient(h * V, left) + Number(1e-6) : Number(1e30);
+    if (!(size(env.bodies[a].position - env.bodies[b].position) - ca.reach - cb.reach - soft < limit)) return;
+    Vec up = vec(Real(0), Real(0), Real(1));
+#if TURNED
+    up = env.turn * up;
+#endif
+    KEEP_LOOP
+    for (int side = 0; side < 2; side++) {
+        const int mine = side ? a : b, other = side ? b : a, first = contact_start(p) + (side ? of_b : 0);
+        const Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(other), sphere_count(other)};
+        const Frame frame = frame_in(env, mine, other, rotations);
+        if (boxes_apart(env.constants[mine], env.constants[other], frame, Number(1 + 1e-5) * (limit + soft))) continue;
+        EACH_OWNED(own.lanes, first, sphere_count(mine), k) {
+            const Place row = env.geometry + 4LL * problem.spheres[first + k];
+            if (beside(env.constants[other], frame, problem.geometry.value + row, limit + soft)) continue;
+            const Real radius = problem.geometry.at(row + 3);
+            const Vec center = env.bodies[mine].position + rotations[mine] * (problem.geometry.vector(row) - env.constants[mine].com);
+            const Vec local = transposed(rotations[other], center - env.bodies[other].position) + env.constants[other].com;
+            Real distance;
+            Vec outward;
+            if (!soft_distance(env.published, spheres, local, limit + plain(radius), transposed(rotations[other], up), distance, outward)) continue;
+            outward = rotations[other] * outward;
+            const Real gap = distance - radius;
+            const Vec normal = side ? outward : -outward;
+            const Vec point = center - (radius + Number(0.5) * gap) * outward;
+            const Vec arm_a = point - env.bodies[a].position, arm_b = point - env.bodies[b].position;
+            const Vec velocity = ma.velocity + cross(ma.omega, arm_a) - mb.velocity - cross(mb.omega, arm_b);
+            const Real speed = dot(velocity, normal);
+            if (!acts(law, gap, speed)) continue;
+            Vec one, two;
+            tangents(env, normal, one, two);
+            const Vec along = pushed(env.published, law, gap, speed, dot(velocity, one), dot(velocity, two));
+            const Vec impulse = along.x * normal + along.y * one + along.z * two;
+            sum.linear = sum.linear + impulse;
+            sum.angular_a = sum.angular_a + cross(arm_a, impulse);
+            sum.angular_b = sum.angular_b + cross(arm_b, impulse);
+        }
+    }
+}
+#endif
+
+// Adds the impulses of all contacts of a step to the bodies' velocities and angular momenta.
+INLINE void collide(const Problem& problem, Environment& env, Own& own, const Mat* rotations, Motion* motions,
+                    Vec* velocities, Vec* spins) {
+    Vec linear[BODIES], angular[BODIES];
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) linear[b] = angular[b] = none();
+    EACH_PAIR
+    for (int p = 0; p < PAIRS; p++) {
+        const int a = pair_a(p), b = pair_b(p);
+        Acting sum = {none(), none(), none()};
+#if PAIRED
+        if (b >= 0) push_pair(problem, env, own, p, rotations, motions, sum);
+#endif
+        if (b < 0 && near_ground(env, a, motions[a])) push_ground(problem, env, own, p, rotations[a], motions[a], sum);
+        linear[a] = linear[a] + own.lanes.sum(sum.linear);
+        angular[a] = angular[a] + own.lanes.sum(sum.angular_a);
+        if (b < 0 || !is_free(b)) continue;
+        linear[b] = linear[b] - own.lanes.sum(sum.linear);
+        angular[b] = angular[b] - own.lanes.sum(sum.angular_b);
+    }
+    EACH_BODY
+    for (int b = 0; b < BODIES; b++) {
+        if (!is_free(b)) continue;
+        velocities[b] = velocities[b] + motions[b].inverse_mass * linear[b];
+        spins[b] = spins[b] + angular[b];
+    }
+}
+#endif
