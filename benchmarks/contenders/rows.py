@@ -78,12 +78,14 @@ def _true(part: Part) -> tuple[str, Row]:
 FLOOR = Floor.name
 REFINED = f"{REFERENCE}, geometry refined"
 PUBLISHED = f"{REFERENCE}, contact_law=paper"
+PUBLISHED_FIXED = f"{PUBLISHED}, geometry=false"
 
 ROWS: dict[str, Row] = dict(
     (
         (REFERENCE, Row(Cgwm)),
         (REFINED, Row(lambda: Cgwm(REFINED, {"geometry": True}))),
         (PUBLISHED, Row(lambda: Cgwm(PUBLISHED, {"contact_law": "paper"}))),
+        (PUBLISHED_FIXED, Row(lambda: Cgwm(PUBLISHED_FIXED, {"contact_law": "paper", "geometry": False}))),
         _paper(4),
         _mujoco("true mesh", true_solid, 1),
         _mujoco("true mesh", true_solid, 4),
