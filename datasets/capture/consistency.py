@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...schemas import Body, CaptureManifest, Ground, InputDataError, Shape
 from .folder import CaptureFolder
+from .handedness import mirrored_axes
 from .surface_distance import surface_distance
 from .tracked_motion import TrackedMotion, outline_of, tracked_motions
 from .unit_mistakes import LENGTHS, ORDERS, Correction, frame_corrections, ground_correction, unit_corrections
@@ -141,6 +142,11 @@ def check_consistency(capture: CaptureFolder) -> list[str]:
     wrong_order = _better_order(manifest, motions)
     if wrong_order is not None:
         raise _fault(capture, "a body that lies on the ground reaches into it", [wrong_order])
+    exchange = mirrored_axes(manifest, motions)
+    if exchange is not None:
+        raise _fault(
+            capture, "what the ground does to the body's path contradicts what it does to its turns", [exchange]
+        )
     return list(_warnings(manifest, motions, where))
 
 

@@ -50,6 +50,8 @@ from .work import checked_work
 
 Array = NDArray[np.float64]
 
+WARMUP_S = 0.1
+"""Usual duration of the start of an episode that a model may use [s]."""
 DATASET_NOISE = Noise(1e-4, 1e-3)
 """Assumed noise of the poses of a dataset, which are exact (position [m], rotation [rad])."""
 
@@ -59,7 +61,7 @@ def evaluate(
     model: Path,
     target: Path,
     split: str = "test",
-    warmup_s: float = 0.1,
+    warmup_s: float = WARMUP_S,
     device: str = "auto",
     accept_units: bool = False,
     reference: Reference = "auto",
@@ -128,7 +130,7 @@ def evaluate_model(
     model: Model,
     capture: Capture,
     split: str = "test",
-    warmup_s: float = 0.1,
+    warmup_s: float = WARMUP_S,
     device: str = "auto",
     keep_frames: bool = False,
     brief: bool = False,
@@ -169,6 +171,7 @@ def evaluate_model(
     video_times = [_video_times(capture, name, cameras.get(name, [])) for name, _ in episodes]
     fits = 0 if brief else STATE_FIT_EPISODES
     world, fitted = _worlds_with_random_effects(world, model, capture, episodes, noise, warnings, brief)
+    warmup_s = _outlasted(warmup_s, episodes, warnings)
     predictions = _predict(model, world, episodes, noise, warmup_s, video_times, fits, fitted)
 
     def compare(prediction: EpisodePrediction) -> tuple[VideoComparison, ...]:
@@ -232,7 +235,7 @@ def _worlds_with_random_effects(
     return known, with_fitted_groups(world, episodes, model.file, capture.groups, noise)
 
 
-def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s: float = 0.1) -> Evaluation:
+def evaluate_dataset(model: Model, dataset: Path, split: str = "test", warmup_s: float = WARMUP_S) -> Evaluation:
     """Evaluate a model against the stored states of a dataset's rollouts; see :func:`evaluate`."""
     reader = RolloutReader(dataset, None if split == "test" else split)
     try:
@@ -338,6 +341,15 @@ def _predict(
     bar = progress(desc="eval: rollouts", total=len(episodes), unit="episode")
     with checked_work(world, episodes, state_fits), bar:
         return predict(world, episodes, noise, warmup_s, video_times, bar.update, state_fits, fitted)
+
+
+def _outlasted(warmup_s: float, episodes: Sequence[Episode], warnings: list[str]) -> float:
+    """Return the warm-up [s]: half of the longest episode in place of a usual one that none of them outlasts."""
+    longest = max(float(np.ptp(track.time_s)) for _, tracks in episodes for track in tracks.values())
+    if warmup_s != WARMUP_S or longest > warmup_s:
+        return warmup_s
+    warnings.append(f"no episode is longer than {1e3 * longest:.0f} ms: models see the first half of it.")
+    return longest / 2
 
 
 def _cameras(model: Model, capture: Capture, episodes: Sequence[str], warnings: list[str]) -> dict[str, list[str]]:

@@ -59,6 +59,8 @@ class _Predicted:
     """Positions of the free bodies [m], shape (E, T, nf, 3); inf where the rollout diverged."""
     free: Tensor
     """The same without any contact."""
+    noise: Noise
+    """Standard deviations of the tracks."""
 
     @staticmethod
     def of(world: World, episodes: Sequence[Episode], noise: Noise) -> _Predicted:
@@ -76,9 +78,8 @@ class _Predicted:
                 measure(seen.world(one), seen.state, seen.times_s, seen.drives).position_m[:, :, columns]
                 for one in (world, replace(world, touching=False))
             )
-        return _Predicted(
-            world=world, seen=seen, after=beyond, last=last, model=torch.nan_to_num(model, nan=torch.inf), free=free
-        )
+        model = torch.nan_to_num(model, nan=torch.inf)
+        return _Predicted(world=world, seen=seen, after=beyond, last=last, model=model, free=free, noise=noise)
 
     @property
     def size_m(self) -> float:
@@ -144,7 +145,8 @@ class _Predicted:
         for item in range(len(found)):
             for column in range(heights.shape[2]):
                 at = self.seen.seen[item, :, column] > 0
-                found[item] |= _supported(self.seen.times_s[item, at], heights[item, at, column], pull)
+                times_s, height_m = self.seen.times_s[item, at], heights[item, at, column]
+                found[item] |= _supported(times_s, height_m, pull, self.noise.position_m)
         return found
 
     def _cause(self) -> str:
@@ -205,15 +207,55 @@ def _sentence(error_m: float, other_m: float, worse_than: str | None, touched: i
     return f"The model does not describe this motion: {'; '.join(parts)}. Likely cause: {cause}."
 
 
-def _supported(times_s: Tensor, height_m: Tensor, pull_m_s2: float) -> bool:
+def _supported(times_s: Tensor, height_m: Tensor, pull_m_s2: float, noise_m: float = 0.0) -> bool:
     """Return whether heights (T,) stay level for a while, or turn from falling to rising at once."""
     if len(times_s) < 4:
         return False
+    return _stays_level(times_s, height_m, pull_m_s2) or _turns_up(times_s, height_m, pull_m_s2, noise_m)
+
+
+def _stays_level(times_s: Tensor, height_m: Tensor, pull_m_s2: float) -> bool:
+    """Return whether heights (T,) stay level for a while, other than at the top of a flight that lift makes flat."""
     free_m = 0.5 * pull_m_s2 * (LIMITS.level_s / 2) ** 2
+    level_m = LIMITS.level_share * free_m
     ends = torch.searchsorted(times_s, times_s + LIMITS.level_s)
     for first, end in enumerate(ends.tolist()):
         part = height_m[first : end + 1]
-        if end < len(times_s) and len(part) > 3 and float(part.max() - part.min()) < LIMITS.level_share * free_m:
-            return True
-    rate = height_m.diff() / times_s.diff()
-    return bool(((rate[:-2] < -LIMITS.turn_m_s) & (rate[2:] > LIMITS.turn_m_s)).any())
+        if end < len(times_s) and len(part) > 3 and float(part.max() - part.min()) < level_m:
+            around = [height for height in (height_m[:first], height_m[end + 1 :]) if len(height)]
+            if not around or not all(float(part.min() - height.min()) > level_m for height in around):
+                return True
+    return False
+
+
+def _turns_up(times_s: Tensor, height_m: Tensor, pull_m_s2: float, noise_m: float) -> bool:
+    """Return whether heights (T,) turn from falling to rising between two neighbouring pieces of a track.
+
+    The pieces are so long that noise does not show such a turn. A step between them, as of a track that goes on with
+    another body, is none.
+    """
+    step_s = float(times_s.diff().median())
+    most = max(3, int(LIMITS.level_s / 2 / max(step_s, 1e-9)))
+    count, least = 3, LIMITS.turn_m_s
+    while count < most and _slope_error(count, step_s, noise_m) > least / LIMITS.turn_sigmas:
+        count += 1
+    if len(times_s) < 2 * count:
+        return False
+    at, height = times_s.unfold(0, count, 1), height_m.unfold(0, count, 1)
+    off = at - at.mean(1, keepdim=True)
+    rate = (off * height).sum(1) / off.square().sum(1).clamp_min(1e-18)
+    down, up = rate[:-count], rate[count:]
+    fitted = height.mean(1, keepdim=True) + rate[:, None] * off
+    # within a piece gravity bends, and a step between bodies does more
+    bent_m = pull_m_s2 * (count * step_s) ** 2 / 8 + LIMITS.turn_sigmas * noise_m
+    straight = (height - fitted).abs().amax(1) <= bent_m
+    gap_s, step_m = at[count:, 0] - at[:-count, -1], (height[count:, 0] - height[:-count, -1]).abs()
+    joined = step_m <= torch.maximum(-down, up) * gap_s + LIMITS.turn_sigmas * noise_m
+    least = max(least, LIMITS.turn_sigmas * _slope_error(count, step_s, noise_m))
+    turned = (down < -least) & (up > least) & joined & straight[:-count] & straight[count:]
+    return bool(turned.any())
+
+
+def _slope_error(count: int, step_s: float, noise_m: float) -> float:
+    """Return the standard error [m/s] of a line's slope through so many frames."""
+    return noise_m / max(step_s, 1e-9) * (12 / (count * (count**2 - 1))) ** 0.5

@@ -356,7 +356,10 @@ class DescribedThresholds:
     level_share: float = threshold(
         0.3, "1", "change of height that is none, as a share of that of free fall about its highest point", BY_ARGUMENT
     )
-    turn_m_s: float = threshold(0.2, "m/s", "speed from falling to rising within three frames: a bounce", BY_ARGUMENT)
+    turn_m_s: float = threshold(
+        0.2, "m/s", "speed from falling to rising between two neighbouring pieces of a track: a bounce", BY_ARGUMENT
+    )
+    turn_sigmas: float = threshold(5.0, "standard errors", "the same: at least so many", BY_ARGUMENT)
     near_sizes: float = threshold(
         0.1, "sizes", "distance to what could be touched from which shape or ground are named as the cause", BY_ARGUMENT
     )

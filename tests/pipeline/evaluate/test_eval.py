@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 from cgwm.datasets.capture.capture import Capture
-from cgwm.datasets.capture.tracks import Track, write_tracks
+from cgwm.datasets.capture.tracks import Episode, Track, write_tracks
 from cgwm.datasets.models.model import write_model
 from cgwm.pipeline.evaluate.evaluation import Evaluation
 from cgwm.pipeline.evaluate.prediction import Motion
-from cgwm.pipeline.evaluate.stage import evaluate, evaluate_model
+from cgwm.pipeline.evaluate.stage import WARMUP_S, _outlasted, evaluate, evaluate_model
 from cgwm.pipeline.physics import State, world_of_model
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.trajectories.state_uncertainty import covariance_root
@@ -254,6 +254,15 @@ def test_model_without_physics_is_refused(capture: Capture) -> None:
     model = replace(model, file=model.file.model_copy(update={"contact": None}))
     with pytest.raises(InputDataError, match="no fitted physics"):
         evaluate_model(model, capture)
+
+
+def test_a_usual_warm_up_that_no_episode_outlasts_is_half_of_the_longest() -> None:
+    long = [Episode("0", {"cube": Track(np.arange(0, 0.3, 0.1), np.zeros((3, 3)))})]
+    short = [Episode("0", {"cube": Track(np.array([0.0, 0.03, 0.08]), np.zeros((3, 3)))})]
+    warnings: list[str] = []
+    assert _outlasted(WARMUP_S, long, warnings) == WARMUP_S and _outlasted(5.0, short, warnings) == 5.0
+    assert not warnings and _outlasted(WARMUP_S, short, warnings) == pytest.approx(0.04)
+    assert warnings == ["no episode is longer than 80 ms: models see the first half of it."]
 
 
 def test_warm_up_longer_than_every_episode_is_refused(capture: Capture) -> None:

@@ -120,6 +120,7 @@ def predicted(model: torch.Tensor, measured: torch.Tensor, free: torch.Tensor | 
         last=torch.full((count,), 2),
         model=model[:, :, None],
         free=(model if free is None else free)[:, :, None],
+        noise=NOISE,
     )
 
 
@@ -213,10 +214,25 @@ def test_a_bounce_is_fast_and_a_support_lasts() -> None:
     for speed, found in ((1.05 * LIMITS.turn_m_s, True), (0.95 * LIMITS.turn_m_s, False)):
         # falls ever more slowly before, rises ever faster after: level nowhere
         bounce = speed * (times - 0.295).abs() + 20 * (times - 0.295).square()
-        bounce[28:33] = speed * (times[28:33] - 0.295).abs()
+        bounce[27:33] = speed * (times[27:33] - 0.295).abs()
         assert _supported(times, bounce, 9.81) is found
     free_m = 0.5 * 9.81 * (LIMITS.level_s / 2) ** 2 * LIMITS.level_share
     for change, found in ((0.97 * free_m, True), (1.1 * free_m, False)):
         assert _supported(times, change / LIMITS.level_s * times, 9.81) is found
     short = times[times < 0.95 * LIMITS.level_s]
     assert not _supported(short, 0 * short, 9.81)
+
+
+def test_noise_swapped_markers_and_flat_tops_are_no_support() -> None:
+    rng = np.random.default_rng(3)
+    times = torch.arange(0, 0.8, 0.001, dtype=torch.float64)
+    thrown = 3 * times - 4.905 * times**2
+    noisy = thrown + 5e-4 * torch.as_tensor(rng.normal(size=len(times)))
+    assert not _supported(times, noisy, 9.81, 5e-4)
+    bounced = torch.where(times < 0.4, 0.785 - 4.905 * times**2, 3 * (times - 0.4) - 4.905 * (times - 0.4) ** 2)
+    assert _supported(times, bounced + (noisy - thrown), 9.81, 5e-4)
+    slow = times[::8]
+    swapped = torch.where(slow < 0.5, 0.3 - slow, 1.0 + slow)  # on to a body that rises
+    assert not _supported(slow, swapped, 9.81, 5e-4)
+    lifted = 1.2 * (slow - 0.4) ** 2  # a spin that carries most of the weight
+    assert not _supported(slow, -lifted, 9.81, 5e-4) and _supported(slow, lifted, 9.81, 5e-4)
