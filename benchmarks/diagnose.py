@@ -111,6 +111,8 @@ def _named(case: Case, truth: dict[str, Any], found: dict[str, Any]) -> str:
         return ("exact" if marks == {"exact"} else "class") + (", and more" if beside else "")
     if marks <= {"exact", "class", "among"} and not beside:
         return "among"
+    if all(group <= set(truth["engine"].get("comes_with", ())) for group in groups.values()):
+        return "silent"  # of what is hidden: what the engine's own law brings is in the motion, and no wrong name
     return "family" if marks & {"exact", "class", "among", "family"} else "wrong"
 
 

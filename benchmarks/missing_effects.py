@@ -6,9 +6,11 @@
     python benchmarks/missing_effects.py export OUT --stage development --each 6 --nulls 3
 
 The captures are those of `real_like`; each contender is one file of `contenders/` (`effects_base.py` is its interface):
-`cgwm`; `bic`, stepwise selection over the same library by BIC with one noise; `sysid`, a likelihood-ratio test of each
-candidate in MuJoCo; `sindy`, sparse regression on smoothed accelerations. Captures and answers are stored one by one
-under out/ and taken up again. Thresholds, of rivals too, may be chosen on the stage development alone.
+`cgwm`, as a user runs it, with what the default fit takes into the model by itself counted as named; `bic`, stepwise
+selection over the same library by BIC with one noise; `sysid`, a likelihood-ratio test of each candidate in MuJoCo;
+`sindy`, sparse regression on smoothed accelerations; and, asked for by name alone, `cgwm_plain`, whose fit takes
+nothing by itself. Captures and answers are stored one by one under out/ and taken up again. Thresholds, of
+rivals too, may be chosen on the stage development alone.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from store import ROOT, Store, timed
 
 CONTENDERS: dict[str, Callable[[], EffectNamer]] = {
     "cgwm": lambda: import_module("contenders.effects_cgwm").Cgwm(refit=True),
+    "cgwm_plain": lambda: import_module("contenders.effects_cgwm").Cgwm(refit=True, plain=True),
     "bic": lambda: import_module("contenders.effects_bic").StepwiseBic(),
     "sysid": lambda: import_module("contenders.effects_sysid").MujocoSysid(),
     "sindy": lambda: import_module("contenders.effects_sindy").SparseRegression(),
@@ -106,6 +109,10 @@ def report(rows: Sequence[dict[str, Any]], planned: Sequence[tuple[str, RealCase
         failed = [row for row in own.values() if "failed" in row]
         lines += [f"- {row['case']}: failed, as if answered by nothing ({row['failed'][:100]})" for row in failed]
         lines += _not_run(wanted, own)
+        took = [row for row in answered.values() if row.get("taken")]
+        if took:
+            lines.append(f"In {len(took)} of {len(answered)} captures the fit took something by itself:")
+            lines += [f"- {row['case']}: {', '.join(row['taken'])}" for row in took]
         lines += _added(list(answered.values()))
         seconds = [row["cpu_s"] for row in answered.values()]
         if seconds:
@@ -182,10 +189,12 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("what", choices=("run", "table", "export"))
     parser.add_argument("out", nargs="?", type=Path, help="of export")
     parser.add_argument("--stage", choices=STAGES, default="development")
-    parser.add_argument("--contenders", default=",".join(CONTENDERS), help="separated by commas")
+    every = ",".join(who for who in CONTENDERS if who != "cgwm_plain")
+    parser.add_argument("--contenders", default=every, help="separated by commas")
     parser.add_argument("--nulls", type=int, default=NULLS, help="for each engine")
     parser.add_argument("--each", type=int, default=EACH, help="captures of each other row")
     parser.add_argument("--more", type=int, default=0, help="further captures of what is in no library")
+    parser.add_argument("--tossed", type=int, default=0, help="further captures of many throws")
     parser.add_argument("--only", default="", help="part of the name")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with one thread")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no capture after this time")
@@ -198,7 +207,8 @@ def main(words: Sequence[str] | None = None) -> int:
     if given.record and (given.only or not given.stage.startswith("report")):
         parser.error("--record wants a report: --stage report..., without --only.")
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers start with it
-    chosen = [case for case in real_cases(given.stage, given.nulls, given.each, given.more) if given.only in case.name]
+    every_case = real_cases(given.stage, given.nulls, given.each, given.more, given.tossed)
+    chosen = [case for case in every_case if given.only in case.name]
     captures = given.captures or ROOT / "out" / "real_like" / given.stage
     if given.what == "export":
         if given.out is None:
@@ -242,8 +252,8 @@ def _recorded(
         print("a contender has no answer: nothing is recorded.", file=sys.stderr)
         return False
     figures: Any = import_module("missing_effects_figures")
-    counts = {"each": options.each, "nulls": options.nulls, "more": options.more}
-    each = " ".join(f"--{name} {count}" for name, count in counts.items() if count or name != "more")
+    counts = {"each": options.each, "nulls": options.nulls, "more": options.more, "tossed": options.tossed}
+    each = " ".join(f"--{name} {count}" for name, count in counts.items() if count or name in ("each", "nulls"))
     figures.record_figures(rows, f"python benchmarks/missing_effects.py run --stage {options.stage} {each}")
     return True
 

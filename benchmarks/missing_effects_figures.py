@@ -50,6 +50,12 @@ def figures(who: str, rows: Sequence[Row]) -> Iterator[Row]:
             bool(mark["false"]) for truth, mark in judged if truth["row"] == "null" and truth["engine_name"] == engine
         ]
         yield _most(who, f"real-like, nothing hidden, motions of {engine}: a wrong name", alarms, MOST_FALSE_NULLS)
+    tossed = [(truth, mark) for truth, mark in judged if truth["row"] == "tossed"]
+    hidden = [mark["mark"] in RIGHT for truth, mark in tossed if truth["effects"]]
+    yield _least(who, "real-like, fourteen throws, effects of flight and measurement, named", hidden, None)
+    yield _most(who, "real-like, fourteen throws: a wrong name", [bool(mark["false"]) for _, mark in tossed], None)
+    took = [bool(set(row.get("taken", ())) & set(mark["false"])) for row, (_, mark) in zip(rows, judged, strict=True)]
+    yield _most(who, "real-like, all captures: the fit takes by itself what is not there", took, None)
     wrong = [bool(mark["false"]) for _, mark in judged]
     yield _most(who, "real-like, all captures: a wrong name", wrong, None)
     yield from _added(who, [row for row, (_, mark) in zip(rows, judged, strict=True) if mark["mark"] in RIGHT])

@@ -42,11 +42,12 @@ from cgwm.datasets.synthetic.hidden_effects.rotation import rotation_of, turn
 from cgwm.datasets.synthetic.hidden_effects.things import Kind
 from cgwm.pipeline.diagnose import diagnose
 from cgwm.pipeline.fit import fit
-from cgwm.schemas import CaptureManifest, CgwmError, read_toml
-from diagnose import base_settings, brief, judged
+from cgwm.schemas import CaptureManifest, CgwmError, PhysConfig, read_toml
+from contenders.effects_cgwm import taken
+from diagnose import SILENT, brief, judged
 from hidden_effects import EFFECTS, Case, make_capture
 from hidden_effects import ENGINES as KNOWN_ENGINES
-from real_like.engines import COMES_WITH, ENGINE_OF, GROUPS, can_hide, missing
+from real_like.engines import ENGINE_OF, GROUPS, can_hide, missing
 from real_like.score import rate, wilson
 from render_results import record
 from store import ROOT, Store, commit_of_tree, timed
@@ -64,6 +65,7 @@ Stage = Literal[
     "report9",
     "report10",
     "report11",
+    "report12",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Each report stage is read once, after everything is fixed; the next run takes the next one."""
@@ -157,10 +159,8 @@ class Desk:
         return row if row is not None and row["commit"] == commit_of_tree() else None
 
     def truth(self) -> dict[str, Any]:
-        """Return the truth, with what the group's law of contact implies."""
-        truth = json.loads((self.folder / "truth.json").read_text(encoding="utf-8"))
-        truth["engine"]["comes_with"] = [*truth["engine"]["comes_with"], *COMES_WITH.get(self.of.group, ())]
-        return truth
+        """Return the truth, with what the engine's law of contact has by itself."""
+        return json.loads((self.folder / "truth.json").read_text(encoding="utf-8"))
 
     def make(self, number: int) -> bool:
         """Make the capture of a round unless it is there; return whether it is now."""
@@ -186,8 +186,11 @@ class Desk:
         began = time.process_time()
         shutil.rmtree(model, ignore_errors=True)
         try:
-            fit(self.capture(number), model, stage="phys-geo", phys_config=base_settings("tracks"))
+            took = taken(fit(self.capture(number), model, phys_config=PhysConfig()))
             found: dict[str, Any] = diagnose(model, self.capture(number)).model_dump(mode="json")
+            if took:  # a user reads what the default fit takes into the model by itself before any diagnosis
+                found["selected"] = [*found["selected"], *took]
+                found["verdict"] = "missing_effect" if found["verdict"] in SILENT else found["verdict"]
         except CgwmError as error:
             found = {"refused": error.found}
         asked = (found.get("next_motions") or {}).get("motions", [])[:MOST_MOTIONS]

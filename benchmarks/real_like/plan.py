@@ -34,14 +34,18 @@ Stage = Literal[
     "report16",
     "report17",
     "report18",
+    "report19",
 ]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """Thresholds may be chosen on `development` alone. Each report stage is read once, after everything is fixed: the first
 that was not yet run is the one to use, and what it says is never a reason to change the version that it judges."""
-Row = Literal["null", "flight", "measurement", "contact", "pair", "unknown"]
+Row = Literal["null", "flight", "measurement", "contact", "pair", "unknown", "tossed"]
 ROWS: tuple[Row, ...] = get_args(Row)
 RATES_HZ = (60.0, 100.0, 148.0, 240.0)
 TRAIN, TEST = 8, 4
+TOSSES = 14
+"""Training episodes of the row tossed, all throws of a body whose turns are measured: from these a default fit decides
+whether it estimates the centre of mass, its moments and the scale of lengths, too, and hardly ever from mixed ones."""
 NULLS, EACH = 200, 156
 """Nulls for each engine, and captures of each other row (a multiple of the six groups), of a report."""
 FAMILIES: tuple[set[str], ...] = (
@@ -67,7 +71,7 @@ class RealCase:
     """One real-like capture; everything else is drawn from its seed.
 
     name: stable, the seed follows from it; group: of `engines.GROUPS`; thing: the body; effects: hidden; row: of the
-    table; seed: even for development, odd for reports.
+    table; seed: even for development, odd for reports; tosses: training episodes that are all throws, 0 for mixed ones.
     """
 
     name: str
@@ -76,6 +80,7 @@ class RealCase:
     effects: tuple[str, ...]
     row: Row
     seed: int
+    tosses: int = 0
 
     @property
     def engine(self) -> str:
@@ -96,6 +101,8 @@ class RealCase:
         if any(EFFECTS[name].acts == "contact" for name in self.effects):
             protocol = "mixed"
         centroids = self.thing == "ball" and set(self.effects) <= _CENTROIDS and rng.uniform() < 0.3
+        if self.tosses:
+            protocol, centroids = "throws", False
         return Case(
             name=self.name,
             thing=self.thing,
@@ -103,7 +110,7 @@ class RealCase:
             seed=self.seed,
             law=GROUPS[self.group][1],
             protocol=protocol,
-            train=TRAIN,
+            train=self.tosses or TRAIN,
             test=TEST,
             rate_hz=float(rng.choice(RATES_HZ)),
             centroid_only=bool(centroids),
@@ -111,7 +118,7 @@ class RealCase:
         )
 
 
-def real_cases(stage: Stage, nulls: int = NULLS, each: int = EACH, more: int = 0) -> list[RealCase]:
+def real_cases(stage: Stage, nulls: int = NULLS, each: int = EACH, more: int = 0, tossed: int = 0) -> list[RealCase]:
     """Return the cases of a stage: nulls for each engine (MuJoCo's over its settings), and so many of each other row.
 
     A case's name, and with it the whole capture, does not depend on how many there are.
@@ -121,6 +128,8 @@ def real_cases(stage: Stage, nulls: int = NULLS, each: int = EACH, more: int = 0
         nulls: Captures without an effect for each engine.
         each: Captures of each other row.
         more: Further captures of the row unknown, with the laws of `invented`: reports before report9 had none.
+        tossed: Captures of the row tossed, a third each with nothing hidden, an effect of flight and one of the
+            measurement: reports before report19 had none.
 
     Raises:
         ValueError: If there is no such stage.
@@ -132,7 +141,8 @@ def real_cases(stage: Stage, nulls: int = NULLS, each: int = EACH, more: int = 0
         engines.setdefault(ENGINE_OF[group], []).append(group)
     found = [_case(stage, "null", groups[k % len(groups)], k) for groups in engines.values() for k in range(nulls)]
     groups = list(GROUPS)
-    found += [_case(stage, row, groups[k % len(groups)], k) for row in ROWS[1:] for k in range(each)]
+    found += [_case(stage, row, groups[k % len(groups)], k) for row in ROWS[1:-1] for k in range(each)]
+    found += [_tossed(stage, groups[k % len(groups)], k) for k in range(tossed)]
     lists = [kind for kind in _INVENTED if _laws(stage, kind)]
     return found + [_invented(stage, groups[k % len(groups)], k, kind) for kind in lists for k in range(more)]
 
@@ -153,6 +163,19 @@ def _case(stage: Stage, row: Row, group: str, k: int) -> RealCase:
         effects = (str(rng.choice([name for name in fit if can_hide(group, name)])),)
     name = "/".join((stem, thing, "+".join(effects))) if effects else f"{stem}/{thing}"
     return RealCase(name=name, group=group, thing=thing, effects=effects, row=row, seed=seed)
+
+
+def _tossed(stage: Stage, group: str, k: int) -> RealCase:
+    """Return a case of many throws, mostly of a box: with nothing hidden, or an effect of flight or measurement."""
+    stem = f"real-like/{stage}/tossed/{group}/{k}"
+    seed = 2 * (crc32(stem.encode()) // 2) + (stage != "development")
+    rng = np.random.default_rng([seed, *b"plan"])
+    thing: Kind = ("cube", "cube", "ball")[int(rng.integers(3))]
+    acts = (None, "flight", "measurement")[int(rng.integers(3))]
+    fit = [name for name in KNOWN if EFFECTS[name].acts == acts and thing in EFFECTS[name].things]
+    effects = (str(rng.choice(fit)),) if fit else ()
+    name = "/".join((stem, thing, *effects))
+    return RealCase(name=name, group=group, thing=thing, effects=effects, row="tossed", seed=seed, tosses=TOSSES)
 
 
 _INVENTED = ("invented", "bounded")

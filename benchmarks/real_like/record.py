@@ -21,7 +21,7 @@ from cgwm.schemas import Body, BoxShape, CaptureManifest, Ground, Shape, World
 from cgwm.schemas.capture import Episode, SphereShape
 from scipy.spatial.transform import Rotation
 
-from .engines import COMES_WITH, GROUPS
+from .engines import GROUPS
 from .errors import SESSIONS, Errors, draw_errors, noise, seen, session_scales, smooth
 from .plan import RealCase
 from .sizes import Bench, Sized, sized_effect
@@ -134,7 +134,6 @@ def _truth(
     case: RealCase, body: Case, thing: Thing, errors: Errors, sized: list[Sized], episodes: dict[str, Any]
 ) -> dict[str, Any]:
     facts = GROUPS[case.group][0].facts(thing)
-    brought = [*facts["comes_with"], *COMES_WITH.get(case.group, ())]
     return {
         "format": "real-like-truth/1",
         "name": case.name,
@@ -164,6 +163,6 @@ def _truth(
             "friction": thing.friction,
             "damping_ratio": thing.damping_ratio,
         },
-        "engine": {**facts, "comes_with": brought},
+        "engine": facts,
         "episodes": episodes,
     }

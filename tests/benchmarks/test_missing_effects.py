@@ -9,9 +9,11 @@ import pytest
 from cgwm.datasets.synthetic.hidden_effects import EFFECTS
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+from real_like.engines import GROUPS
 from real_like.errors import Errors, draw_errors, noise
 from real_like.invented import BOUNDED, DEVELOPMENT, STRANGE, UNSEEN
 from real_like.plan import STAGES, real_cases
+from real_like.restitution import ball, has_fall
 from real_like.score import judge, wilson
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -141,3 +143,16 @@ def test_the_size_of_a_wind_is_what_it_adds_to_its_drag() -> None:
     found = sized_effect("wind", bench, [5])
     assert found.ratio == pytest.approx(found.drawn_ratio, rel=0.2)
     assert found.size > 10e-3 * EFFECTS["wind"].large[thing.kind]
+
+
+def test_throws_from_which_a_fit_may_choose_are_a_row_of_their_own() -> None:
+    cases = real_cases("development", 0, 0, 0, 30)
+    assert all(case.row == "tossed" and case.body_case().protocol == "throws" for case in cases)
+    assert all(case.body_case().train == 14 and not case.body_case().centroid_only for case in cases)
+    hidden = {EFFECTS[case.effects[0]].acts if case.effects else None for case in cases}
+    assert hidden == {None, "flight", "measurement"}
+
+
+@pytest.mark.parametrize(("group", "falls"), [("mujoco_hard", False), ("mujoco_graded", False)])
+def test_an_engine_brings_a_restitution_by_speed_only_where_its_rebounds_fall_with_it(group: str, falls: bool) -> None:
+    assert has_fall(group, ball()) == falls == ("velocity_restitution" in GROUPS[group][0].facts(ball())["comes_with"])

@@ -31,8 +31,6 @@ _PACKAGES = {
     "mujoco": ("mujoco", "mujoco"),
 }
 """Of each engine: what pip calls its package, and what Python does."""
-COMES_WITH = {"mujoco_graded": ("velocity_restitution",)}
-"""Effects that a group's law of contact implies, beside what its engine declares."""
 
 
 @cache
