@@ -87,6 +87,10 @@ class Placed:
         """Return the velocity (n, C, 3) [m/s] of its material points at `position` (n, C, 3)."""
         return self.velocity[:, None] + cross(self.omega[:, None], position - self.reference[:, None])
 
+    def at(self, items: Tensor) -> Placed:
+        """Return some items (m,)."""
+        return Placed(self.body, *(x[items] for x in (self.reference, self.rotation, self.velocity, self.omega)))
+
     def plain(self) -> Placed:
         """Return the body without derivatives."""
         names = ("com", "centers", "radii")

@@ -12,6 +12,8 @@ from .fixed_surface import HALF_SPACE, FixedSurface
 
 MOST_GAP_M = 0.1
 """Gap between a body and a surface up to which `surface_gap` tells it."""
+NEAR_GAP_M = 0.01
+"""Gap within which the triangles of a mesh are looked at first."""
 
 
 @dataclass(frozen=True)
@@ -108,10 +110,13 @@ def surface_gap(placed: Placed, surface: FixedSurface) -> Tensor:
     still, fixed = placed.plain(), _plain(surface)
     zero = torch.zeros_like(still.reference[:, 0])
     near = fixed.bound(still.reference[:, None]).squeeze(1) - still.reach < MOST_GAP_M
-    if not bool(near.any()):
-        return zero + torch.inf
-    gap = _nearby(still, fixed, zero, zero + MOST_GAP_M).depth.amin(-1)
-    return torch.where(near & (gap < MOST_GAP_M), gap, torch.inf)
+    gap = zero + torch.inf
+    for within in (NEAR_GAP_M, MOST_GAP_M) if fixed.mesh is not None else (MOST_GAP_M,):
+        asked = (near & ~(gap < MOST_GAP_M)).nonzero().squeeze(1)
+        if len(asked):
+            found = _nearby(still.at(asked), fixed, zero[asked], zero[asked] + within).depth.amin(-1)
+            gap[asked] = torch.where(found < within, found, torch.inf)
+    return gap
 
 
 @torch.no_grad()

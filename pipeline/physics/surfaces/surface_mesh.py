@@ -26,7 +26,7 @@ FLAT = 1e-6
 ORDER = (0.2672612419124244, 0.5345224838248488, 0.8017837257372732)
 """Direction along which the contacts of a sphere are sorted by their normals, so that each keeps its slot."""
 _CHUNK = 2_000_000
-"""Number of distances from spheres to triangles that are computed at once."""
+"""Number of cells that are looked up at once."""
 _CELLS = (64, 1 << 18)
 """Least and largest number of cells of a grid."""
 
@@ -61,15 +61,25 @@ class SurfaceMesh:
         return max(size, least, 1e-6)
 
     @cached_property
+    def _cells(self) -> NDArray[np.int64]:
+        """Numbers of cells along the axes (3,)."""
+        return np.floor(np.ptp(self.bounds, axis=0) / self.cell_m).astype(np.int64) + 1
+
+    @cached_property
+    def _first_cells(self) -> NDArray[np.int64]:
+        """The cell (F, 3) of the lowest corner of the box of each triangle."""
+        return self._cell_of(self.topology.corners.min(1))
+
+    def _cell_of(self, places: Array) -> NDArray[np.int64]:
+        """Return the cells (..., 3) of places (..., 3)."""
+        numbers = np.floor((places - self.bounds[0]) / self.cell_m).astype(np.int64)
+        return np.clip(numbers, 0, self._cells - 1)
+
+    @cached_property
     def grid(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Numbers of cells along the axes (3,), first entry of each cell (cells + 1,), and triangles by cell."""
-        low = self.bounds[0]
-        count = np.floor(np.ptp(self.bounds, axis=0) / self.cell_m).astype(np.int64) + 1
-        corners = self.topology.corners
-        first, last = (
-            np.clip(np.floor((x - low) / self.cell_m).astype(np.int64), 0, count - 1)
-            for x in (corners.min(1), corners.max(1))
-        )
+        count, corners = self._cells, self.topology.corners
+        first, last = self._first_cells, self._cell_of(corners.max(1))
         spans = last - first + 1
         sizes = spans.prod(1)
         triangle = np.repeat(np.arange(len(corners)), sizes)
@@ -118,24 +128,50 @@ class SurfaceMesh:
         near = (outside.square().sum(-1) < reach.square()).nonzero().squeeze(1)
         if not len(near):
             return distance, feature
-        corners = self._corners(centers)
-        lowest, highest = ((centers[near] + side * reach[near, None]) for side in (-1, 1))
-        inside = (corners.amin(1) <= highest.amax(0)) & (corners.amax(1) >= lowest.amin(0))
-        chosen = inside.all(1).nonzero().squeeze(1)
-        if not len(chosen):
-            return distance, feature
-        size = max(1, _CHUNK // len(chosen))
-        for part in near.split(size):
-            distance[part], feature[part] = self._query(centers[part], reach[part], chosen)
+        for part in near.split(self._together(reach[near])):
+            distance[part], feature[part] = self._query(centers[part], reach[part])
         return distance, feature
 
-    def _query(self, centers: Tensor, reach: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Return distances and features (Q, MESH_CONTACTS) of spheres against the chosen triangles."""
-        offset, region = _closest(centers, self._corners(centers)[chosen])
-        size = offset.square().sum(-1).sqrt()
-        query, column = (size < reach[:, None]).nonzero(as_tuple=True)
-        away, far, number = offset[query, column], size[query, column], chosen[column] * FEATURES
-        number = number + region[query, column]
+    def _together(self, reach: Tensor) -> int:
+        """Return of how many spheres, with what they reach (Q,), the triangles nearby are looked up at once."""
+        cells = float((2 * reach.max() / self.cell_m + 2) ** 3)
+        return max(1, int(_CHUNK / max(1.0, min(cells, float(len(self.grid[1]))))))
+
+    def _pairs(self, centers: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        """Return which spheres (N,) and triangles (N,) share a cell of the grid, in the order of both, each pair once.
+
+        Args:
+            centers: Centres of the spheres (Q, 3) [m].
+            reach: How far each reaches (Q,) [m].
+        """
+        number, starts, entries = (torch.as_tensor(x, device=centers.device) for x in self.grid)
+        low, most = torch.as_tensor(self.bounds[0]).to(centers), number - 1
+        first, last = (
+            torch.minimum(((centers + side * reach[:, None] - low) / self.cell_m).floor().long().clamp_min(0), most)
+            for side in (-1, 1)
+        )
+        spans = (last - first + 1).clamp_min(0)
+        query, within = _counted(spans.prod(-1))
+        _, wide, high = spans[query].unbind(-1)
+        place = torch.stack((within // (wide * high), within // high % wide, within % high), -1) + first[query]
+        cell = (place[:, 0] * number[1] + place[:, 1]) * number[2] + place[:, 2]
+        row, within = _counted(starts[cell + 1] - starts[cell])
+        triangle = entries[starts[cell[row]] + within]
+        # a triangle in several cells counts in the first one of those that are looked at
+        begins = torch.as_tensor(self._first_cells, device=centers.device)[triangle]
+        query, place = query[row], place[row]
+        once = (torch.maximum(begins, first[query]) == place).all(-1)
+        query, triangle = query[once], triangle[once]
+        order = (query * len(self.topology.corners) + triangle).argsort()
+        return query[order], triangle[order]
+
+    def _query(self, centers: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distances and features (Q, MESH_CONTACTS) of spheres."""
+        query, triangle = self._pairs(centers, reach)
+        away, region = _closest(centers[query], self._corners(centers)[triangle])
+        far = away.square().sum(-1).sqrt()
+        close = far < reach[query]
+        query, away, far, number = (x[close] for x in (query, away, far, triangle * FEATURES + region))
         minimal = self._is_minimal(number, away, far)
         sign = torch.ones_like(far)
         if self.solid:
@@ -235,16 +271,13 @@ def _slotted(spheres: int, query: Tensor, number: Tensor, far: Tensor, away: Ten
 
 
 def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the offsets (Q, F, 3) [m] from triangles (F, 3, 3) to points (Q, 3), and the nearest feature (Q, F).
+    """Return the offsets (N, 3) [m] from triangles (N, 3, 3) to points (N, 3), and the nearest features (N,).
 
     Source: the regions of a triangle in Ericson, "Real-Time Collision Detection", 2005, section 5.1.5.
     """
-    a, b, c = (corners[None, :, k] for k in range(3))
-    p = points[:, None]
-    ab, ac, bc = b - a, c - a, c - b
-    d1, d2 = _dot(ab, p - a), _dot(ac, p - a)
-    d3, d4 = _dot(ab, p - b), _dot(ac, p - b)
-    d5, d6 = _dot(ab, p - c), _dot(ac, p - c)
+    a, b, c = corners.unbind(1)
+    ab, ac, bc, pa, pb, pc = b - a, c - a, c - b, points - a, points - b, points - c
+    d1, d2, d3, d4, d5, d6 = _dot(ab, pa), _dot(ac, pa), _dot(ab, pb), _dot(ac, pb), _dot(ab, pc), _dot(ac, pc)
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     conditions = (
         (4, (d1 <= 0) & (d2 <= 0)),
@@ -256,22 +289,21 @@ def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     )
     region = torch.zeros_like(d1, dtype=torch.int64)
     for number, holds in reversed(conditions):
-        region = torch.where(holds, torch.full_like(region, number), region)
+        region = region.masked_fill(holds, number)
     normal = torch.linalg.cross(ab, ac)
     unit = normal / normal.square().sum(-1, keepdim=True).sqrt()
-    offsets = (
-        _dot(unit, p - a)[..., None] * unit,
-        _off(p - a, ab),
-        _off(p - b, bc),
-        _off(p - a, ac),
-        p - a,
-        p - b,
-        p - c,
-    )
-    offset = torch.zeros_like(offsets[0])
-    for number, value in enumerate(offsets):
-        offset = torch.where((region == number)[..., None], value, offset)
+    offset = _dot(unit, pa)[:, None] * unit
+    for number, (arm, side) in {1: (pa, ab), 2: (pb, bc), 3: (pa, ac)}.items():
+        offset = torch.where((region == number)[:, None], _off(arm, side), offset)
+    for number, arm in {4: pa, 5: pb, 6: pc}.items():
+        offset = torch.where((region == number)[:, None], arm, offset)
     return offset, region
+
+
+def _counted(counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return for each of the things that rows (R,) count its row and its number within that, shapes (N,)."""
+    row = torch.repeat_interleave(counts)
+    return row, torch.arange(len(row), device=row.device) - (counts.cumsum(0) - counts)[row]
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

@@ -167,7 +167,8 @@ def test_the_nearest_place_of_a_triangle_is_on_it_and_nothing_of_it_is_nearer() 
     generator = torch.Generator().manual_seed(0)
     corners = torch.randn(4, 3, 3, generator=generator, dtype=F64)
     points = 2 * torch.randn(60, 3, generator=generator, dtype=F64)
-    offset, region = _closest(points, corners)
+    offset, region = _closest(points.repeat_interleave(4, 0), corners.repeat(60, 1, 1))
+    offset, region = offset.view(60, 4, 3), region.view(60, 4)
     assert set(region.flatten().tolist()) == set(range(7))
     foot = points[:, None] - offset
     weights = torch.linalg.solve(corners.mT, foot[..., None])[..., 0]  # of the corners
