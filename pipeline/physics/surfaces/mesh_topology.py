@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....datasets.shapes.surfaces import require_areas
+from .mesh_overhangs import overhangs
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -32,6 +33,9 @@ class Topology:
     """First way of each feature, shape (F, 7)."""
     way_count: Indices
     """Number of its ways; -1 where another triangle has the feature; shape (F, 7)."""
+    prisms: Array
+    """Of each triangle its unit normal, the outward unit normals of its sides within its plane, and its overhangs above
+    and below, shape (F, 14)."""
 
     @staticmethod
     def of(vertices: Array, faces: Indices, *, solid: bool, name: str) -> Topology:
@@ -50,14 +54,19 @@ class Topology:
         corners = vertices[faces]
         require_areas(corners, name)
         edges = _Edges.of(vertices, faces)
-        start, count, ways = _ways(vertices, faces, edges)
+        start, count, owned, ways = _ways(vertices, faces, edges)
+        pseudonormals = _pseudonormals(corners, faces, edges, len(vertices))
+        ways = ways if len(ways) else np.zeros((1, 3))
+        # whether a point is inside a solid is asked of all triangles at the nearest place
+        beside = overhangs(corners, pseudonormals[:, 0], (start, count, ways), owned | solid)
         return Topology(
             corners=corners,
             solid=solid,
-            pseudonormals=_pseudonormals(corners, faces, edges, len(vertices)),
-            ways=ways if len(ways) else np.zeros((1, 3)),
+            pseudonormals=pseudonormals,
+            ways=ways,
             way_start=start,
-            way_count=count,
+            way_count=np.where(owned, count, -1),
+            prisms=np.concatenate((pseudonormals[:, 0], -edges.inward.reshape(-1, 9), beside), 1),
         )
 
 
@@ -92,17 +101,18 @@ def _joined(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
     return unique, inverse.reshape(-1)[faces]
 
 
-def _ways(vertices: Array, faces: Indices, edges: _Edges) -> tuple[Indices, Indices, Array]:
-    """Return first way and number of ways of each feature (F, 7), and the ways (W, 3)."""
+def _ways(vertices: Array, faces: Indices, edges: _Edges) -> tuple[Indices, Indices, NDArray[np.bool_], Array]:
+    """Return first way and number of ways of each feature (F, 7), whether it is the triangle's, and the ways (W, 3)."""
     start, count = np.zeros((len(faces), 7), np.int64), np.zeros((len(faces), 7), np.int64)
+    owned = np.ones((len(faces), 7), np.bool_)
     # of an edge: into each adjacent triangle; its owner is the first of them
     by_edge = np.argsort(edges.of_half, kind="stable")
     sizes = np.bincount(edges.of_half, minlength=edges.count)
     begins = np.cumsum(sizes) - sizes
     owner = by_edge[begins]
     start[:, 1:4] = begins[edges.of_half].reshape(-1, 3)
-    owned = owner[edges.of_half] == np.arange(len(edges.of_half))
-    count[:, 1:4] = np.where(owned, sizes[edges.of_half], -1).reshape(-1, 3)
+    owned[:, 1:4] = (owner[edges.of_half] == np.arange(len(edges.of_half))).reshape(-1, 3)
+    count[:, 1:4] = sizes[edges.of_half].reshape(-1, 3)
     ways = edges.inward[by_edge]
     # of a corner: along each adjacent edge
     first, second = edges.ends.T
@@ -117,8 +127,9 @@ def _ways(vertices: Array, faces: Indices, edges: _Edges) -> tuple[Indices, Indi
     owners = np.zeros(len(vertices), np.int64)
     owners[seen] = holder
     start[:, 4:] = corner[flat].reshape(-1, 3)
-    count[:, 4:] = np.where(owners[flat] == np.arange(len(flat)), degree[flat], -1).reshape(-1, 3)
-    return start, count, np.concatenate((ways, direction[order]))
+    owned[:, 4:] = (owners[flat] == np.arange(len(flat))).reshape(-1, 3)
+    count[:, 4:] = degree[flat].reshape(-1, 3)
+    return start, count, owned, np.concatenate((ways, direction[order]))
 
 
 def _pseudonormals(corners: Array, faces: Indices, edges: _Edges, vertices: int) -> Array:

@@ -94,17 +94,19 @@ class SurfaceMesh:
         return count, starts, triangle[order]
 
     def numbers(self) -> Array:
-        """Return the numbers that the kernel reads: box, cell, then corners, pseudonormals and ways."""
+        """Return the numbers that the kernel reads: box, cell, then corners, pseudonormals, prisms and ways."""
         t = self.topology
         head = np.concatenate((self.bounds.ravel(), [self.cell_m]))
-        return np.concatenate((head, t.corners.ravel(), t.pseudonormals.ravel(), t.ways.ravel()))
+        return np.concatenate((head, t.corners.ravel(), t.pseudonormals.ravel(), t.prisms.ravel(), t.ways.ravel()))
 
     def indices(self) -> NDArray[np.int64]:
-        """Return the integers that the kernel reads: sizes, then starts and counts of ways, and the grid."""
+        """Return the integers that the kernel reads: sizes, starts and counts of ways, first cells, and the grid."""
         t = self.topology
         count, starts, triangles = self.grid
         head = [*count, len(t.corners), int(t.solid), len(starts)]
-        return np.concatenate((head, t.way_start.ravel(), t.way_count.ravel(), starts, triangles))
+        return np.concatenate(
+            (head, t.way_start.ravel(), t.way_count.ravel(), self._first_cells.ravel(), starts, triangles)
+        )
 
     @torch.no_grad()
     def features(self, centers: Tensor, radii: Tensor, margin: Tensor) -> tuple[Tensor, Tensor]:

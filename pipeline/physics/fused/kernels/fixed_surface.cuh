@@ -89,8 +89,8 @@ struct TriangleMesh {
     Point low, high;
     Number cell;
     int cells[3], solid;
-    const Number *corners, *pseudonormals, *ways;
-    const int *way_start, *way_count, *starts, *triangles;
+    const Number *corners, *pseudonormals, *prisms, *ways;
+    const int *way_start, *way_count, *first_cells, *starts, *triangles;
 };
 
 INLINE TriangleMesh triangle_mesh(const Problem& problem, int s) {
@@ -105,10 +105,12 @@ INLINE TriangleMesh triangle_mesh(const Problem& problem, int s) {
     m.solid = indices[4];
     m.corners = numbers + 7;
     m.pseudonormals = m.corners + 9LL * count;
-    m.ways = m.pseudonormals + 21LL * count;
+    m.prisms = m.pseudonormals + 21LL * count;
+    m.ways = m.prisms + 14LL * count;
     m.way_start = indices + 6;
     m.way_count = m.way_start + 7LL * count;
-    m.starts = m.way_count + 7LL * count;
+    m.first_cells = m.way_count + 7LL * count;
+    m.starts = m.first_cells + 3LL * count;
     m.triangles = m.starts + indices[5];
     return m;
 }
@@ -152,6 +154,18 @@ INLINE bool is_minimal(const TriangleMesh& m, int feature, Point offset, Number 
     return true;
 }
 
+// Whether the distance from a point to the mesh has no minimum within reach at a triangle, since the point is beside it:
+// see `mesh_overhangs.py`.
+INLINE bool is_beside(const TriangleMesh& m, int triangle, Point p, Number reach) {
+    const Number *corners = m.corners + 9LL * triangle, *prism = m.prisms + 14LL * triangle;
+    Point a = p - point(corners);
+    Number height = dot(a, point(prism)), high = height < Number(0) ? -height : height;
+    if (!(high < reach)) return true;
+    Number most = prism[height < Number(0) ? 13 : 12] * high + Number(1e-5) * reach;
+    return dot(a, point(prism + 3)) > most || dot(a, point(prism + 9)) > most ||
+           dot(p - point(corners + 3), point(prism + 6)) > most;
+}
+
 INLINE int cell_of(Number at, Number low, Number cell, int count) {
     Number k = floor((at - low) / cell);
     return k < Number(0) ? 0 : (k > Number(count - 1) ? count - 1 : (int)k);
@@ -184,11 +198,11 @@ __device__ void find(const TriangleMesh& m, Point p, Number radius, Number margi
         int cell = (i * m.cells[1] + j) * m.cells[2] + k;
         for (int entry = m.starts[cell]; entry < m.starts[cell + 1]; entry++) {
             int triangle = m.triangles[entry];
-            const Number* c = m.corners + 9LL * triangle;
             // a triangle in several cells counts in the first one of those that are looked at
-            if (i > from[0] && cell_of(lesser(lesser(c[0], c[3]), c[6]), m.low.x, m.cell, m.cells[0]) < i) continue;
-            if (j > from[1] && cell_of(lesser(lesser(c[1], c[4]), c[7]), m.low.y, m.cell, m.cells[1]) < j) continue;
-            if (k > from[2] && cell_of(lesser(lesser(c[2], c[5]), c[8]), m.low.z, m.cell, m.cells[2]) < k) continue;
+            const int* first = m.first_cells + 3LL * triangle;
+            if ((i > from[0] && first[0] < i) || (j > from[1] && first[1] < j) || (k > from[2] && first[2] < k)) continue;
+            if (is_beside(m, triangle, p, reach)) continue;
+            const Number* c = m.corners + 9LL * triangle;
             Point offset;
             int feature = FEATURES * triangle + closest(c, p, offset);
             Number far = root(dot(offset, offset));

@@ -13,7 +13,7 @@ from cgwm.pipeline.physics.contact_detection import Placed
 from cgwm.pipeline.physics.surfaces.detection import MOST_GAP_M, all_surface_points, near_surface, surface_gap
 from cgwm.pipeline.physics.surfaces.fixed_surface import FixedSurface
 from cgwm.pipeline.physics.surfaces.mesh_topology import Topology
-from cgwm.pipeline.physics.surfaces.surface_mesh import _closest
+from cgwm.pipeline.physics.surfaces.surface_mesh import FEATURES, SurfaceMesh, _closest
 from cgwm.schemas import InputDataError
 from helpers import fixed_surfaces as fixed
 from helpers.worlds import F64, ball_body, box_body, law, state_of, times, world_of
@@ -212,3 +212,44 @@ def test_a_body_nears_a_surface_by_its_speed_and_by_its_spin() -> None:
     assert near(0.015 + 0.01 * 10 * reach, 2.0, 10.0) and not near(0.025 + 0.01 * 10 * reach, 2.0, 10.0)
     far = Placed(body, torch.tensor([[0.0, 0.0, 2 * MOST_GAP_M + 1]], dtype=F64), turn, still, still)
     assert surface_gap(far, plane).tolist() == [math.inf]
+
+
+def _rough(rough_m: float) -> SurfaceMesh:
+    """Return a sheet of 128 triangles, whose corners are as much too high or too low."""
+    generator = np.random.default_rng(3)
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.1, 0.1, 9)))
+    vertices = np.stack((x, y, rough_m * generator.standard_normal(81)), 1)
+    first = (np.arange(8)[:, None] * 9 + np.arange(8)).ravel()
+    faces = np.concatenate((first[:, None] + [0, 1, 10], first[:, None] + [0, 10, 9]))
+    return SurfaceMesh(Topology.of(vertices, faces, solid=False, name="rough"))
+
+
+@pytest.mark.parametrize(("mesh", "share"), [(_rough(0.0), 0.7), (_rough(1e-4), 0.7), (_rough(0.02), 0.1)])
+def test_no_contact_is_on_a_triangle_that_counts_as_beside(mesh: SurfaceMesh, share: float) -> None:
+    generator = np.random.default_rng(0)
+    places, reach = generator.uniform((-0.1, -0.1, -0.05), (0.1, 0.1, 0.05), (2000, 3)), 0.04
+    # half of them straight above and below edges and corners
+    feature = generator.integers(1, 7, 1000)
+    triangle = generator.integers(0, len(mesh.topology.corners), 1000)
+    corners, normals = mesh.topology.corners[triangle], mesh.topology.pseudonormals[triangle, 0]
+    ends = np.arange(1000), feature % 3
+    middle = np.where(feature[:, None] > 3, corners[ends], 0.5 * (corners + np.roll(corners, -1, 1))[ends])
+    places[:1000] = middle + normals * generator.uniform(-0.04, 0.04, (1000, 1))
+    centers = torch.from_numpy(places)
+    radii = torch.full((2000,), reach, dtype=F64)
+    distance, found = mesh.features(centers, radii, 0 * radii)
+    sphere, slot = torch.isfinite(distance).nonzero(as_tuple=True)
+    assert len(sphere) > 1000 and int((found[sphere, slot] % FEATURES > 0).sum()) > 100
+    assert not _beside(mesh, (found[sphere, slot] // FEATURES).numpy(), places[sphere], reach).any()
+    sphere, triangle = (part.numpy() for part in mesh._pairs(centers, radii))
+    assert _beside(mesh, triangle, places[sphere], reach).mean() > share
+
+
+def _beside(mesh: SurfaceMesh, triangle: np.ndarray, places: np.ndarray, reach: float) -> np.ndarray:
+    """Return whether places (N, 3) are beside triangles (N,), as `is_beside` of the kernel."""
+    corners, prism = mesh.topology.corners[triangle], mesh.topology.prisms[triangle]
+    arm, second = places - corners[:, 0], places - corners[:, 1]
+    height = (arm * prism[:, :3]).sum(1)
+    most = np.where(height < 0, prism[:, 13], prism[:, 12]) * abs(height) + 1e-5 * reach
+    out = [(arm * prism[:, 3:6]).sum(1), (second * prism[:, 6:9]).sum(1), (arm * prism[:, 9:12]).sum(1)]
+    return (abs(height) >= reach) | (np.max(out, 0) > most)
