@@ -117,9 +117,8 @@ def import_capture(
         typer.Option(
             "--columns",
             metavar="KEY=NAME,...",
-            help="csv: names of columns that are not recognised (time, body, px .. pz, qw .. qz, roll, pitch, yaw, "
-            "wx .. wz); "
-            "hdf5: names of datasets (time, position, quat_wxyz, quat_xyzw).",
+            help="csv: names of columns that are not recognised (time, take, body, px .. pz, qw .. qz, roll, pitch, "
+            "yaw, wx .. wz); hdf5: names of datasets (time, position, quat_wxyz, quat_xyzw).",
             show_default=False,
         ),
     ] = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,26 +21,34 @@ EULER = ("roll", "pitch", "yaw")
 SPIN = ("wx", "wy", "wz")
 FORCE = ("fx", "fy", "fz")
 REQUIRED = ("time", "px", "py", "pz")
-COLUMNS = ("time", "body", "px", "py", "pz", *QUATERNION, *EULER, *SPIN, *FORCE)
-"""Quantities that a column may contain; `body`, the orientation (a quaternion, or three angles with their order), the
-spin (w, three) and the force that the body exerts (f, three) are optional."""
+COLUMNS = ("time", "take", "body", "px", "py", "pz", *QUATERNION, *EULER, *SPIN, *FORCE)
+"""Quantities that a column may contain; `take` (which of several in one file), `body`, the orientation (a quaternion,
+or three angles with their order), the spin (w, three) and the force that the body exerts (f, three) are optional."""
 EULER_ORDERS = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 """Orders of the turns, first to last: about fixed axes in small letters, about the body's in capitals."""
 _NAMES = {
     "time": ("time", "t", "timestamp", "timestamps", "stamp"),
+    "take": ("take", "trial", "episode", "throw", "toss", "shot"),
     "body": ("body", "object", "rigid_body"),
     **{f"p{axis}": (f"p{axis}", axis, f"t{axis}", f"pos_{axis}", f"position_{axis}") for axis in "xyz"},
     **{f"q{part}": (f"q{part}", f"q_{part}", f"quat_{part}", f"orientation_{part}") for part in "wxyz"},
     **{name: (name, f"euler_{axis}") for name, axis in zip(EULER, "xyz", strict=True)},
-    **{
-        f"w{axis}": (f"w{axis}", f"w{axis}_rad", f"omega_{axis}", f"omega_{axis}_rad", f"angular_velocity_{axis}")
-        for axis in "xyz"
-    },
+    **{f"w{axis}": (f"w{axis}", f"omega_{axis}", f"angular_velocity_{axis}", f"spin_{axis}") for axis in "xyz"},
     **{f"f{axis}": (f"f{axis}", f"f{axis}_n", f"force_{axis}", f"force_{axis}_n") for axis in "xyz"},
 }
 _FRAMES = ("frame", "frames", "frame_number", "frame_index", "frame_id")
 """Names of a column that counts frames, read where the frame rate is given."""
 _UNIT = re.compile(r"^(.*?)[ _]*[(\[_ ](m|cm|mm|in|s|ms|us|ns)[)\]]?$")
+_SPIN_UNIT = re.compile(r"^(.*?)[ _]*[(\[_ ](rad/s|rad_s|deg/s|deg_s|rpm|rev/min|rev/s|rps)[)\]]?$")
+_SPINS_RAD_S = {
+    "rad": 1.0,
+    "deg": math.pi / 180,
+    "rpm": math.pi / 30,
+    "rev/min": math.pi / 30,
+    "rev/s": 2 * math.pi,
+    "rps": 2 * math.pi,
+}
+"""Units of angular velocities in rad/s, each by its name without `/s`, or with it where that is not its name."""
 _ANGLE_UNIT = re.compile(r"^(.*?)[ _]*[(\[_ ](deg|rad)[)\]]?$")
 
 
@@ -87,13 +96,15 @@ class Header:
     """Units, from the column names or stated."""
     angle_unit: AngleUnit | None = None
     """Unit of the angles of `EULER`, if they are read."""
+    spin_rad_s: float = 1.0
+    """Unit of the angular velocities of `SPIN` [rad/s]."""
     decimal_comma: bool = False
     """Whether a comma may separate the decimals, where it does not separate the columns."""
 
     @property
     def quantities(self) -> list[str]:
         """Quantities that are numbers, in the order of `COLUMNS`."""
-        return [name for name in COLUMNS if name in self.index and name != "body"]
+        return [name for name in COLUMNS if name in self.index and name not in ("body", "take")]
 
 
 def read_header(path: Path, found: list[str], stated: Conventions) -> Header:
@@ -114,7 +125,8 @@ def read_header(path: Path, found: list[str], stated: Conventions) -> Header:
         index = {key: k for key, k in index.items() if key not in EULER}
     _require_columns(path, names, index, stated)
     angles = _angle_unit(path, [names[index[key]] for key in EULER if key in index], stated.angle_unit)
-    return Header(index, _units(path, names, index, stated), angles)
+    spin = _spin_unit(path, [names[index[key]] for key in SPIN if key in index])
+    return Header(index, _units(path, names, index, stated), angles, spin)
 
 
 def _require_names(path: Path, names: list[str]) -> None:
@@ -217,6 +229,19 @@ def _angle_unit(path: Path, names: list[str], stated: AngleUnit | None) -> Angle
     return "deg" if named == {"deg"} else "rad"
 
 
+def _spin_unit(path: Path, names: list[str]) -> float:
+    """Return the unit [rad/s] of the angular velocities in the columns `names`, which these may say."""
+    found = [match[2] if (match := _SPIN_UNIT.match(name.strip().lower())) else "rad/s" for name in names]
+    plain = {re.sub("^(rad|deg)[/_]s$", r"\1", unit) for unit in found}
+    if len(plain) > 1:
+        raise InputDataError(
+            f"{path}: units of angular velocity that differ: {', '.join(sorted(plain))}.",
+            "one unit for all three.",
+            "convert the columns to one unit, and name it in the first line.",
+        )
+    return _SPINS_RAD_S[plain.pop()] if plain else 1.0
+
+
 def _place(path: Path, names: list[str], key: str, stated: Conventions) -> int | None:
     """Return the index of the column with the quantity `key`, or None."""
     if key in stated.columns:
@@ -251,7 +276,8 @@ def _stated_place(path: Path, names: list[str], key: str, name: str) -> int:
 
 def _quantity(name: str, key: str) -> str:
     """Return a column's name in lower case without the unit that a quantity `key` may have."""
-    found = _ANGLE_UNIT.match(name.strip().lower()) if key in EULER else None
+    units = _ANGLE_UNIT if key in EULER else _SPIN_UNIT if key in SPIN else None
+    found = units.match(name.strip().lower()) if units else None
     return _plain(found[1] if found else name)[0]
 
 

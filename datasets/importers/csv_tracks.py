@@ -83,8 +83,9 @@ def import_csv(
         files = track_files(Path(source), (".csv",))
         left_out: Counter[str] = Counter()
         renamed: dict[str, str] = {}
-        tracks = (_tracks(path, stated, body, left_out, renamed, spin_frame) for path in files)
-        result = write_tracks(directory, out, [path.stem for path in files], tracks, up, (n_train, n_test, seed))
+        takes = [one for path in files for one in _takes(path, stated, body, left_out, renamed, spin_frame)]
+        stems = [stem for stem, _ in takes]
+        result = write_tracks(directory, out, stems, (own for _, own in takes), up, (n_train, n_test, seed))
     said = (*_left_out_warnings(left_out, len(files), euler), *_renamed_warnings(renamed))
     return result.model_copy(update={"warnings": (*result.warnings, *said)})
 
@@ -108,8 +109,8 @@ def _left_out_warnings(left_out: Counter[str], files: int, euler: str | None) ->
     named = ", ".join(f"{shown(name)}{place}" for name, place in places.items())
     angles = "" if euler else "; or roll, pitch, yaw with the order of their turns, such as --euler xyz"
     return (
-        f"columns that were not read: {named}. Read are time, body, px, py, pz, qw, qx, qy, qz{angles}; "
-        "wx, wy, wz (rad/s; beside orientations with --spin-frame), fx, fy, fz (N).",
+        f"columns that were not read: {named}. Read are time, take, body, px, py, pz, qw, qx, qy, qz{angles}; "
+        "wx, wy, wz (rad/s, or wx_rpm, wx_deg_s; beside orientations with --spin-frame), fx, fy, fz (N).",
     )
 
 
@@ -119,25 +120,52 @@ def _renamed_warnings(renamed: Mapping[str, str]) -> tuple[str, ...]:
     return (f"blanks in names of bodies became '-': {named}.",) if named else ()
 
 
-def _tracks(
+def _takes(
     path: Path,
     stated: Conventions,
     body: str,
     left_out: Counter[str],
     renamed: dict[str, str],
     spin_frame: Literal["world", "body"] | None,
-) -> dict[str, Track]:
-    """Return the tracks of a file; count its columns that are not read, and note what its bodies are called."""
+) -> list[tuple[str, dict[str, Track]]]:
+    """Return the takes of a file, each with what it is called and its tracks by body.
+
+    Columns that are not read are counted, and what bodies are called is noted.
+    """
     text, separator = _without_comments(read_text(path))
     rows = csv_rows(path, text, separator)
     names = next((row for _, row in rows if any(cell.strip() for cell in row)), [])
     header = replace(_with_told_spin(read_header(path, names, stated), spin_frame), decimal_comma=separator != ",")
     left_out.update(name.strip() for k, name in enumerate(names) if k not in header.index.values())
-    by_body = _samples(path, header, len(names), rows, body, renamed)
-    if not by_body:
+    by_take = _samples(path, header, len(names), rows, body, renamed)
+    if not by_take:
         raise InputDataError(f"{path}: no samples.", todo="add at least 2, or remove the file.")
-    tracks = {name: _track(f"{path}: {name}", header, np.array(values), stated) for name, values in by_body.items()}
-    return {name: _with_body_spin(track) for name, track in tracks.items()} if spin_frame == "world" else tracks
+    found = []
+    for take, by_body in by_take.items():
+        called = f"{path}: {take}: " if len(by_take) > 1 else f"{path}: "
+        tables = {name: np.array(values) for name, values in by_body.items()}
+        _require_one_take(path, header, tables)
+        tracks = {name: _track(f"{called}{name}", header, table, stated) for name, table in tables.items()}
+        if spin_frame == "world":
+            tracks = {name: _with_body_spin(track) for name, track in tracks.items()}
+        found.append((f"{path.stem}-{take}" if len(by_take) > 1 else path.stem, tracks))
+    return found
+
+
+def _require_one_take(path: Path, header: Header, tables: Mapping[str, Array]) -> None:
+    """Refuse times that begin anew several times: several takes, one after the other."""
+    if "time" not in header.index:
+        return
+    for table in tables.values():
+        time = table[:, header.quantities.index("time")]
+        starts = np.flatnonzero(np.diff(time) < 0) + 1
+        late = time[starts] - time[0] > 0.2 * np.ptp(time)
+        if len(starts) and not late.any() and np.diff(starts, prepend=0, append=len(time)).min() > 3:
+            raise InputDataError(
+                f"{path}: the times begin anew {len(starts)} times, as of {len(starts) + 1} takes in one file.",
+                "one file for each take, or a column with the number of the take.",
+                "name the column that holds it, such as --columns take=NAME, or write each take into its own file.",
+            )
 
 
 def _with_told_spin(header: Header, spin_frame: Literal["world", "body"] | None) -> Header:
@@ -202,7 +230,9 @@ class _Parts:
         if quat is None and angles is not None and stated.euler is not None:
             quat = _quaternions(angles, stated.euler, header.angle_unit == "deg")
         position = np.stack([column[key] for key in ("px", "py", "pz")], 1)
-        return _Parts(time / (stated.frame_rate_hz or 1.0), position, quat, columns(SPIN), columns(FORCE))
+        spin = columns(SPIN)
+        omega = None if spin is None else header.spin_rad_s * spin
+        return _Parts(time / (stated.frame_rate_hz or 1.0), position, quat, omega, columns(FORCE))
 
 
 def _quaternions(angles: Array, order: str, degrees: bool) -> Array:
@@ -238,10 +268,10 @@ def _samples(
     rows: Iterable[tuple[int, list[str]]],
     body: str,
     renamed: dict[str, str],
-) -> dict[str, list[list[float]]]:
-    """Return the numbers of the lines by body, as the header orders them; every line has `width` cells."""
+) -> dict[str, dict[str, list[list[float]]]]:
+    """Return the numbers of the lines by take and body, as the header orders them; every line has `width` cells."""
     wanted = header.quantities
-    by_body: dict[str, list[list[float]]] = {}
+    by_take: dict[str, dict[str, list[list[float]]]] = {}
     for line, row in rows:
         if not any(cell.strip() for cell in row):
             continue
@@ -249,12 +279,13 @@ def _samples(
             raise InputDataError(
                 f"{path}, line {line}: {len(row)} values under {width} columns.", todo="correct the line."
             )
+        by_body = by_take.setdefault(row[header.index["take"]].strip() if "take" in header.index else "", {})
         if "body" in header.index:
             name = _body_name(row[header.index["body"]].strip(), renamed, f"{path}, line {line}")
         else:
             name = body if body in by_body else require_name(body, "--body")
         by_body.setdefault(name, []).append([_number(path, line, row, header, key) for key in wanted])
-    return by_body
+    return by_take
 
 
 def _body_name(name: str, renamed: dict[str, str], where: str) -> str:

@@ -32,6 +32,11 @@ LENGTHS_M: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 TIMES_S: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOWEST_STEP_S, _LONGEST_PATH_M = 1.0, 100.0
 """Largest time step and largest extent of a path for which numbers without a unit count as seconds and metres."""
+_FALL_S, _LIKE = 0.12, 0.45
+"""Duration of a piece of motion whose acceleration is looked at, and its difference from gravity, as a logarithm, up to
+which a unit is likely: less than half of the one between centimetres and inches."""
+_STEADY = 5.0
+"""Steps of a body that moves, in units of the smallest difference between two numbers of its track."""
 FASTEST_RAD_S = 5000.0
 """Largest angular velocity [rad/s]: 50 000 turns a minute; larger ones are in degrees."""
 _LONGEST_NAME = 150
@@ -111,12 +116,15 @@ class Units:
         self._require_likely(where, time, position)
         omega = None if omega_rad_s is None else _spin(where, omega_rad_s[seen])
         quat = None if quat_wxyz is None else _unit(where, quat_wxyz[seen])
+        fresh = _not_repeated(where, position, quat)
+        time, position, quat = time[fresh], position[fresh], None if quat is None else quat[fresh]
+        omega, force_n = None if omega is None else omega[fresh], None if force_n is None else force_n[seen][fresh]
         track = Track(
             time * TIMES_S[self.time or "s"],
             position * LENGTHS_M[self.length or "m"],
             quat,
             omega_body_rad_s=omega,
-            force_n=None if force_n is None else _force(where, force_n[seen]),
+            force_n=None if force_n is None else _force(where, force_n),
         )
         _require_in_range(where, track)
         return track
@@ -130,8 +138,20 @@ class Units:
             raise InputDataError(
                 f"{where}: positions spread over {spread:.6g}: hardly metres.",
                 "metres, or another unit that is named.",
-                "add --length-unit mm (or, if these are metres: --length-unit m).",
+                f"add --length-unit {self._likely_length(time, position)} (or, if these are metres: --length-unit m).",
             )
+
+    def _likely_length(self, time: Array, position: Array) -> str:
+        """Return the unit of length in which the body falls as on Earth for most of the time; mm where in none."""
+        frames = max(int(np.searchsorted(time - time[0], _FALL_S / TIMES_S[self.time or "s"])), 4)
+        pieces = [slice(k, k + frames) for k in range(0, len(time) - frames + 1, frames)]
+        if not pieces:
+            return "mm"
+        seconds = time * TIMES_S[self.time or "s"]
+        bends = [np.polyfit(seconds[one] - seconds[one][0], position[one], 2)[0] for one in pieces]
+        strength = 2 * float(np.median(np.linalg.norm(bends, axis=1)))
+        fits = [unit for unit, metres in LENGTHS_M.items() if abs(np.log(max(strength * metres, 1e-9) / 9.81)) < _LIKE]
+        return fits[0] if fits else "mm"
 
 
 def _with_a_pose(where: str, position: Array, quat_wxyz: Array | None) -> NDArray[np.bool_]:
@@ -143,6 +163,31 @@ def _with_a_pose(where: str, position: Array, quat_wxyz: Array | None) -> NDArra
     if len(known) and (outside := len(seen) - (known[-1] - known[0] + 1)):  # gaps inside: `gap_warnings`
         note(f"{where}: {outside} samples before the first pose or after the last one are left out")
     return seen
+
+
+def _not_repeated(where: str, position: Array, quat_wxyz: Array | None) -> NDArray[np.bool_]:
+    """Return which samples (T,) are none that repeat the one before to the last digit while the body moves, and say so.
+
+    A tracker that was late, or a file whose frame rate was doubled, repeats poses; the body did not stand still.
+    """
+    same = (np.diff(position, axis=0) == 0).all(1)
+    if quat_wxyz is not None:
+        same &= (np.diff(quat_wxyz, axis=0) == 0).all(1)
+    fresh = np.append(True, ~same)
+    steps = np.abs(np.diff(position[fresh], axis=0))
+    if not same.any() or not steps.any():
+        return np.ones(len(position), bool)
+    digit = float(steps[steps > 0].min())
+    size = np.linalg.norm(steps, axis=1)
+    number = np.cumsum(fresh) - 1  # of the last fresh sample
+    around = np.minimum(size[np.maximum(number - 1, 0).clip(max=len(size) - 1)], size[number.clip(max=len(size) - 1)])
+    left_out = ~fresh & (around > _STEADY * digit)
+    if left_out.any():
+        note(
+            f"{where}: {int(left_out.sum())} of {len(position)} samples repeat the pose before them to the last digit "
+            "while the body moves: they are left out"
+        )
+    return ~left_out
 
 
 def _require_times(where: str, time: Array) -> None:

@@ -61,10 +61,17 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
         raise InputDataError(
             f"{capture.root}: split '{split}' has {len(episodes)} episodes with tracks of all moving bodies.",
             f"at least {THRESHOLDS.verdict.min_episodes}: an effect found in one has to be confirmed in others.",
-            "record more, or name another split with --split.",
+            _more_episodes(capture, split),
         )
     chosen = np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_EPISODES)).round().astype(int)
     return DiagnosedEpisodes(tuple(episodes[k] for k in chosen), known, warnings, filmed)
+
+
+def _more_episodes(capture: Capture, split: str) -> str:
+    """Return what to do where a split has too few episodes: others of the capture may go into it."""
+    others = [name for name in capture.episodes() if name not in capture.episodes(split)]
+    moved = f"move some of {', '.join(others[:3])} into '{split}' of [splits] in capture.toml, " if others else ""
+    return f"{moved}{'or ' if others else ''}record more, or name another split with --split."
 
 
 def _filmed(model: Model, capture: Capture, split: str) -> list[Episode]:

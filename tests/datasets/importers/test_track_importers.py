@@ -356,6 +356,53 @@ def test_milliseconds_and_millimetres_are_not_taken_for_seconds_and_metres(tmp_p
     assert track_of(tmp_path / "out", "a").position_m[1, 2] == 400
 
 
+@pytest.mark.parametrize(("unit", "metres"), [("cm", 0.01), ("mm", 0.001), ("in", 0.0254)])
+def test_the_unit_in_which_a_body_falls_is_named(unit: str, metres: float, tmp_path: Path) -> None:
+    t = np.arange(0, 1, 0.02)
+    place = np.stack((4 * t, 0 * t, 5 * t - 4.905 * t**2 + 1), 1) / metres
+    write_csv(tmp_path / "a.csv", "t,x,y,z", t, *place.T)
+    assert f"add --length-unit {unit} (or," in fault(tmp_path, import_csv, tmp_path / "a.csv")
+
+
+def test_takes_in_one_file_are_episodes(tmp_path: Path) -> None:
+    lines = [f"{take},{t},{t + take},0,{1 - t}" for take in (3, 1, 10) for t in (0.0, 0.1, 0.2, 0.3)]
+    path = tmp_path / "all.csv"
+    path.write_text("\n".join(["Trial,t,x,y,z", *lines]))
+    result = import_csv(path, tmp_path / "out")
+    assert result.episodes == 3 and not result.warnings
+    assert Capture.open(tmp_path / "out").episodes() == ["all-1", "all-10", "all-3"]
+    assert track_of(tmp_path / "out", "all-10").position_m[0, 0] == 10
+    path.write_text("\n".join(["n,t,x,y,z", *lines]))
+    text = fault(tmp_path, import_csv, path)
+    assert "the times begin anew 2 times, as of 3 takes in one file" in text and "--columns take=NAME" in text
+    import_csv(path, tmp_path / "named", columns={"take": "n"})
+    assert len(Capture.open(tmp_path / "named").episodes()) == 3
+
+
+@pytest.mark.parametrize(("names", "unit"), [("wx_rpm,wy_rpm,wz_rpm", np.pi / 30), ("wx (deg/s),wy (deg/s),wz (deg/s)",
+    np.pi / 180), ("wx,wy,wz", 1.0)])  # fmt: skip
+def test_spins_are_in_the_unit_of_their_names(names: str, unit: float, tmp_path: Path) -> None:
+    spins = np.random.default_rng(1).normal(size=(5, 3)).round(3)
+    import_csv(spinning(tmp_path / "a.csv", False, spins, names), tmp_path / "out")
+    np.testing.assert_allclose(track_of(tmp_path / "out", "a").omega_body_rad_s, unit * spins, atol=1e-5)
+    mixed = spinning(tmp_path / "b.csv", False, spins, "wx_rpm,wy_rpm,wz_rad_s")
+    assert "units of angular velocity that differ: rad, rpm" in fault(tmp_path, import_csv, mixed)
+
+
+def test_poses_that_are_repeated_while_the_body_moves_are_left_out(tmp_path: Path) -> None:
+    t = np.arange(40) / 100
+    place = np.stack((2 * t, 1.2345 * t, 1 - 4.905 * t**2), 1).round(4)
+    late = place.copy()
+    late[[7, 20, 21]] = late[[6, 19, 19]]
+    for name, times, rows, kept in (
+        ("late", t, late, 37), ("doubled", np.arange(80) / 200, np.repeat(place, 2, 0), 40),
+        ("rests", t, np.zeros((40, 3)), 40), ("rounded", t, (0.1 * place).round(2), 40), ("plain", t, place, 40),
+    ):  # fmt: skip
+        write_csv(tmp_path / f"{name}.csv", "t,x,y,z", times, *rows.T)
+        import_csv(tmp_path / f"{name}.csv", tmp_path / name)
+        assert len(track_of(tmp_path / name, name)) == kept, name
+
+
 def test_tum(tmp_path: Path) -> None:
     rows = np.c_[1305031102.1 + TIMES, POSITIONS, QUATS[:, [1, 2, 3, 0]].round(5)]
     text = "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(" ".join(f"{v:.6f}" for v in row) for row in rows)
