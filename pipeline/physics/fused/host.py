@@ -121,5 +121,5 @@ def _order(table: Tensor) -> Tensor:
 @cache
 def _library(structure: Structure, wide: int = 0) -> ctypes.CDLL:
     source = kernel_file("host_prelude") + structure.source(host=True, wide=wide) + kernel_file("host_entry")
-    vectors = kernel_build.vector_flags() if wide or structure.hulled else ()
+    vectors = kernel_build.vector_flags() if wide or structure.hulled or structure.published else ()
     return kernel_build.host_library(source, (*FLAGS, *vectors, *(WIDE_FLAGS if wide else ())))

@@ -331,10 +331,9 @@ class Structure:
     def widens(self) -> bool:
         """Whether a CPU can simulate several environments in one vector: one free body above the ground, no records."""
         alone = self.free == (True,) and not self.paired and self.tree is None and set(self.drives) == {-1}
-        plain = not (
-            self.single or self.dual or self.record or self.carried or self.areas or self.turned or self.published
-        )
-        return alone and plain and self.lanes == 1 and self.contacts <= _MOST_WIDE
+        plain = not (self.single or self.dual or self.record or self.carried or self.areas or self.turned)
+        few = self.contacts <= _MOST_WIDE or bool(self.published)  # the paper's law keeps no list of contacts
+        return alone and plain and self.lanes == 1 and few
 
     def source(self, host: bool = False, wide: int = 0) -> str:
         """Return the source: constants, then the files of `kernels/`; for the host without the kernel entry.

@@ -15,7 +15,7 @@ INLINE void share_by_area(const Lanes& lanes, const Moments& moments, const Movi
 }
 #endif
 
-#if !GATHERED
+#if !GATHERED && !PUBLISHED
 // Finds the contacts of a body with the ground. They are appended to the list (LISTED), or each is stored in its own
 // slot.
 INLINE void touch_plane(const Problem& problem, const Environment& env, const Own& own, int p, const Mat& rotation,

@@ -1,5 +1,5 @@
 // Gap, normal and point of each possible contact of two bodies; formulas of `physics/contact_detection.py`.
-#if PAIRED || PUBLISHED
+#if PAIRED || (PUBLISHED && TURNED)
 // Two unit tangents of a contact, orthogonal to its normal, chosen in the world frame.
 INLINE void tangents(const Environment& env, Vec normal, Vec& first, Vec& second) {
 #if TURNED

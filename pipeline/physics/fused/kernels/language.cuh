@@ -96,9 +96,11 @@
 #define DEEP (MESHES || HULLS)  // labels have gaps weighted by impulses, where slots may have nothing at the frame
 // An impulse, or 0 in environments where the contact is not on.
 #if WIDE
-#define WHERE_ON(c, impulse) choose((c).on, impulse, none())
+#define WHERE_ON(c, impulse) WHERE((c).on, impulse)
+#define WHERE(on, impulse) choose(on, impulse, none())
 #else
 #define WHERE_ON(c, impulse) (impulse)
+#define WHERE(on, impulse) (impulse)
 #endif
 #if QUEUED || GATHERED
 #define SLOT_OF(contact) (contact)

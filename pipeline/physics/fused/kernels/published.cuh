@@ -4,7 +4,113 @@
 const double NEGLIGIBLE = 40;  // exponent: exp(-40) is less than rounding
 const double LINEAR = 20;      // exponent from which SoftPlus is taken as its argument, as in torch
 
-// The soft maximum of a force and 0; the plain one where it has no sharpness.
+#if HOST && !SINGLE && defined(__AVX__) && !defined(__clang__)
+// The functions of SoftPlus to rounding, for a number or for vectors of them: half of the time of a rollout would be that of
+// the library's, and vectors of rollouts have the bits of each alone.
+#if WIDE
+typedef Row Many;
+typedef Marks ManyWhole;
+#else
+typedef double Many __attribute__((vector_size(32)));
+typedef long long ManyWhole __attribute__((vector_size(32)));
+#endif
+
+// exp(-m) for m from 0 to NEGLIGIBLE: 2^n times the series of a remainder below log(2) / 2.
+template <class V, class W> INLINE V fading(V m) {
+    static const double each[] = {1.0 / 6227020800, 1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880,
+                                  1.0 / 40320, 1.0 / 5040, 1.0 / 720, 1.0 / 120, 1.0 / 24, 1.0 / 6, 1.0 / 2, 1.0, 1.0};
+    const V rounding = V{} + 6755399441055744.0;  // 1.5 * 2^52: the last bits of a sum with it are the whole number
+    const V shifted = rounding - m * 1.4426950408889634, whole = shifted - rounding;
+    const V rest = (-m - whole * 6.93147180369123816490e-01) - whole * 1.90821492927058770002e-10;  // log(2) in two parts
+    V sum = V{} + each[0], power;
+    for (int k = 1; k < 14; k++) sum = sum * rest + each[k];
+    W bits;
+    __builtin_memcpy(&bits, &shifted, sizeof bits);
+    bits = (bits + 1023) << 52;
+    __builtin_memcpy(&power, &bits, sizeof power);
+    return sum * power;
+}
+
+// log(1 + e) for e from 0 to 1: the series of 2 artanh of e / (2 + e), or of what 1 + e is to 2, which is nearer to 1.
+template <class V> INLINE V log_above_one(V e) {
+    static const double each[] = {2.0 / 23, 2.0 / 21, 2.0 / 19, 2.0 / 17, 2.0 / 15, 2.0 / 13,
+                                  2.0 / 11, 2.0 / 9, 2.0 / 7, 2.0 / 5, 2.0 / 3, 2.0};
+    const auto high = e > 0.41421356237309503;
+    const V z = (high ? e - 1.0 : e) / (high ? e + 3.0 : e + 2.0), z2 = z * z;
+    V sum = V{} + each[0];
+    for (int k = 1; k < 12; k++) sum = sum * z2 + each[k];
+    return z * sum + (high ? V{} + 0.6931471805599453 : V{});
+}
+
+// exp(-|x|) and the logistic function of x.
+template <class V, class W> INLINE V logistic(V x, V& e) {
+    const V most = V{} + NEGLIGIBLE, size = x < 0.0 ? -x : x;
+    e = fading<V, W>(size < most ? size : most);
+    return (x > 0.0 ? V{} + 1.0 : e) / (e + 1.0);
+}
+
+// SoftPlus with a sharpness of 1, and its slope.
+template <class V, class W> INLINE V soft_plus(V x, V& slope) {
+    V e;
+    slope = logistic<V, W>(x, e);
+    const V soft = (x > 0.0 ? x : V{}) + log_above_one<V>(e);
+    return x < -NEGLIGIBLE ? V{} : soft;
+}
+
+INLINE Real sigmoid(Real x) {
+#if WIDE
+    Row e;
+    return Wide(logistic<Row, Marks>(x.of, e));
+#else
+    double e;
+    const double value = logistic<double, long long>(plain(x), e);
+#if DUAL
+    return Real(value, x.tangent * value * (1.0 - value));
+#else
+    return value;
+#endif
+#endif
+}
+
+// The soft maxima of the forces of all rows and 0; plain ones where they have no sharpness.
+INLINE void soften(Real* forces, Number sharpness) {
+    if (!some(sharpness > Number(0))) {
+        for (int d = 0; d < PUBLISHED; d++) forces[d] = at_least(forces[d], Number(0));
+        return;
+    }
+#if WIDE
+    for (int d = 0; d < PUBLISHED; d++) {
+        const Row x = forces[d].of, exponent = sharpness.of * x;
+        const Flag linear = Flag(exponent > LINEAR);
+        Row slope;
+        if (!every(linear)) forces[d] = choose(linear, forces[d], Wide(soft_plus<Row, Marks>(exponent, slope) / sharpness.of));
+    }
+#else
+    for (int first = 0; first < PUBLISHED; first += 4) {
+        Many exponent = Many{} - 2 * NEGLIGIBLE, slope;
+        const int count = PUBLISHED - first < 4 ? PUBLISHED - first : 4;
+        bool bent = false;
+        for (int k = 0; k < count; k++) {
+            exponent[k] = sharpness * plain(forces[first + k]);
+            bent = bent || !(exponent[k] > LINEAR);
+        }
+        if (!bent) continue;
+        const Many soft = soft_plus<Many, ManyWhole>(exponent, slope) / sharpness;
+        for (int k = 0; k < count; k++) {
+            Real& force = forces[first + k];
+            if (exponent[k] > LINEAR) continue;
+#if DUAL
+            force = Real(soft[k], force.tangent * slope[k]);
+#else
+            force = soft[k];
+#endif
+        }
+    }
+#endif
+}
+#else
+INLINE Real sigmoid(Real x) { return reciprocal(Real(1) + exponential(-x)); }
+
 INLINE Real softened(Real force, Number sharpness) {
     if (!(sharpness > Number(0))) return at_least(force, Number(0));
     const Number exponent = sharpness * plain(force);
@@ -18,24 +124,35 @@ INLINE Real softened(Real force, Number sharpness) {
 #endif
 }
 
+// The soft maxima of the forces of all rows and 0; plain ones where they have no sharpness.
+INLINE void soften(Real* forces, Number sharpness) {
+    SPREAD
+    for (int d = 0; d < PUBLISHED; d++) forces[d] = softened(forces[d], sharpness);
+}
+#endif
+
 // The published clamp of a distance; the distance itself where it has none.
 INLINE Real clamped(const Published& p, Real gap) {
-    if (!(p.clamp_per_m > Number(0))) return gap;
+    if (!some(p.clamp_per_m > Number(0))) return gap;
     const Real far = gap + Real(p.zero_m);
-    const Real inside = reciprocal(Real(1) + exponential(-(p.clamp_per_m * far)));
-    return inside * (far + Real(p.clamp_depth_m)) - Real(p.clamp_depth_m);
+    return sigmoid(p.clamp_per_m * far) * (far + Real(p.clamp_depth_m)) - Real(p.clamp_depth_m);
 }
 
 // The impulse of a contact, given its gap, the speed at which the gap widens and the slip along its tangents; along the
 // normal, then the tangents.
 INLINE Vec pushed(const Published& p, const Law& law, Real gap, Real speed, Real one, Real two) {
-    Vec sum = none();
+    Real forces[PUBLISHED];
     const Real distance = clamped(p, gap);
     SPREAD
     for (int d = 0; d < PUBLISHED; d++) {
         const Real along = speed - law.friction * (Number(facet_x(d)) * one + Number(facet_y(d)) * two);
-        const Real force = -(law.stiffness * (law.step_s * along + distance)) - law.damping * along;
-        const Real impulse = law.step_s * softened(force, p.softplus_per_n);
+        forces[d] = -(law.stiffness * (law.step_s * along + distance)) - law.damping * along;
+    }
+    soften(forces, p.softplus_per_n);
+    Vec sum = none();
+    SPREAD
+    for (int d = 0; d < PUBLISHED; d++) {
+        const Real impulse = law.step_s * forces[d];
         sum.x += impulse;
         sum.y -= Number(facet_x(d)) * impulse;
         sum.z -= Number(facet_y(d)) * impulse;
@@ -46,8 +163,8 @@ INLINE Vec pushed(const Published& p, const Law& law, Real gap, Real speed, Real
 }
 
 // Whether a contact acts: its gap is closed, or closes within the step.
-INLINE bool acts(const Law& law, Real gap, Real speed) {
-    return plain(gap) < Number(0) || plain(gap) + plain(law.step_s) * plain(speed) < Number(0);
+INLINE Flag acts(const Law& law, Real gap, Real speed) {
+    return (plain(gap) < Number(0)) | (plain(gap) + plain(law.step_s) * plain(speed) < Number(0));
 }
 
 struct Acting {  // impulse of the contacts of a pair on a, and its moments about both centres of mass
@@ -60,9 +177,11 @@ INLINE void push_ground(const Problem& problem, const Environment& env, const Ow
     const int a = pair_a(p), start = contact_start(p);
     const Law& law = env.laws[0];
     const Real height = env.bodies[a].position.z - env.ground;
+#if TURNED
     const Vec up = vec(Real(0), Real(0), Real(1));
     Vec one, two;
     tangents(env, up, one, two);
+#endif
     // no point of the body sinks further in this step, up to rounding
     const Number fall = size(m.velocity) + size(m.omega) * env.constants[a].reach;
     const Number far = plain(law.step_s) * fall + Number(1e-6);
@@ -70,14 +189,20 @@ INLINE void push_ground(const Problem& problem, const Environment& env, const Ow
         const Place row = env.geometry + 4LL * problem.spheres[start + k];
         const Vec held = problem.geometry.vector(row) - env.constants[a].com;
         const Real radius = problem.geometry.at(row + 3);
-        if (plain(height) + plain(dot(rotation.z, held)) - plain(radius) > far) continue;
+        if (every(plain(height) + plain(dot(rotation.z, held)) - plain(radius) > far)) continue;
         Vec arm = rotation * held;
         arm.z = arm.z - radius;
         const Real gap = height + arm.z;
         const Vec velocity = m.velocity + cross(m.omega, arm);
-        if (!acts(law, gap, velocity.z)) continue;
+        const Flag on = acts(law, gap, velocity.z);
+        if (!some(on)) continue;
+#if TURNED
         const Vec along = pushed(env.published, law, gap, velocity.z, dot(velocity, one), dot(velocity, two));
         const Vec impulse = along.x * up + along.y * one + along.z * two;
+#else
+        const Vec along = pushed(env.published, law, gap, velocity.z, velocity.x, velocity.y);
+        const Vec impulse = WHERE(on, vec(along.y, along.z, along.x));
+#endif
         sum.linear = sum.linear + impulse;
         sum.angular_a = sum.angular_a + cross(arm, impulse);
     }
@@ -179,7 +304,7 @@ INLINE void collide(const Problem& problem, Environment& env, Own& own, const Ma
 #if PAIRED
         if (b >= 0) push_pair(problem, env, own, p, rotations, motions, sum);
 #endif
-        if (b < 0 && near_ground(env, a, motions[a])) push_ground(problem, env, own, p, rotations[a], motions[a], sum);
+        if (b < 0 && some(near_ground(env, a, motions[a]))) push_ground(problem, env, own, p, rotations[a], motions[a], sum);
         linear[a] = linear[a] + own.lanes.sum(sum.linear);
         angular[a] = angular[a] + own.lanes.sum(sum.angular_a);
         if (b < 0 || !is_free(b)) continue;

@@ -12,15 +12,17 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.optimization.forward_mode import batched_jacobian
 from cgwm.pipeline.physics import PaperLaw, Rollout, State, World, engine, simulate
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
+from cgwm.pipeline.physics.fused import host
 from cgwm.pipeline.physics.fused.host import simulate_on_host
 from cgwm.pipeline.physics.fused.packing import reason_against
 from cgwm.pipeline.physics.parameters import apply_parameters, contact_parameters
 from cgwm.schemas import UsageError
+from helpers import fused_host
 from helpers.fixed_surfaces import half_space
 from helpers.worlds import F64, ball_body, batch, box_body, state_of, times, world_of
 from torch import Tensor
 
-from .test_fused import NEEDS_COMPILER, UPRIGHT, Fused, agree, cube, fused, on_host, tossed
+from .test_fused import NEEDS_COMPILER, NEEDS_GPU, UPRIGHT, Fused, agree, cube, fused, on_cuda, on_host, tossed
 
 __all__ = ("fused",)
 MASS, MU, TIME, RATIO = 0.4, 0.4, 0.01, 0.6
@@ -105,8 +107,15 @@ def test_bodies_that_touch_on_a_slope_by_the_published_distance(fused: Fused, la
     agree(expected, fused(world, state, times(0.1), driven, False, lanes=lanes), 1e-9)
 
 
-@NEEDS_COMPILER
-def test_derivatives_are_those_of_torch_and_of_differences() -> None:
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        pytest.param(simulate_on_host, marks=NEEDS_COMPILER),
+        pytest.param(on_cuda, marks=NEEDS_GPU),
+        pytest.param(partial(on_host, lanes=4), marks=[NEEDS_COMPILER, pytest.mark.evidence]),
+    ],
+)
+def test_derivatives_are_those_of_torch_and_of_differences(kernel: Fused) -> None:
     world, state, driven = pushed()
     parameters = contact_parameters(world)
     point = batch([MU, TIME, RATIO])
@@ -116,14 +125,25 @@ def test_derivatives_are_those_of_torch_and_of_differences() -> None:
         found: Rollout = run(apply_parameters(world, parameters, values), start, times(0.06), driven)
         return torch.cat((found.position_m[:, -1], found.quat_wxyz[:, -1]), -1).flatten(1)
 
-    (_, expected), (_, found) = (
-        batched_jacobian(lambda x, n, run=run: ends(run, x, n), point) for run in (simulate, partial(on_host, lanes=1))
-    )
+    expected, found = (batched_jacobian(partial(ends, run), point)[1].cpu() for run in (simulate, kernel))
     torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
     assert float(found.abs().amax((0, 1)).min()) > 1e-4
     change = 1e-6 * torch.diag(point[0])
     up, down = ends(simulate, torch.cat((point + change, point - change)), 6).view(2, 3, -1)
     torch.testing.assert_close(found[0].T, (up - down) / (2e-6 * point.T), rtol=1e-4, atol=1e-5)
+
+
+@NEEDS_COMPILER
+@pytest.mark.evidence
+def test_vectors_of_rollouts_have_the_bits_of_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host, "width", fused_host.PRODUCT_WIDTH)
+    world, _ = tumbling()
+    state = tossed(40, 0.06)
+    together = simulate_on_host(world, state, times(0.15))
+    for item in (0, 17, 39):
+        alone = simulate_on_host(world, State(*(part[item : item + 1] for part in state.tensors)), times(0.15))
+        assert torch.equal(alone.position_m[0], together.position_m[item])
+        assert torch.equal(alone.omega_body_rad_s[0], together.omega_body_rad_s[item])
 
 
 def test_a_rollout_does_not_depend_on_the_others_of_its_batch() -> None:
