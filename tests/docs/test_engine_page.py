@@ -113,6 +113,11 @@ def test_the_gain_with_few_photos_is_paired_by_capture() -> None:
     assert few_photos.gain(stored, "8 photos", "translation_mm", "two stages", "floor") == (-9.0, -9.0, -9.0)
     assert few_photos.chart(stored).count("<polyline points") == 2 * 3 + 3  # and the legend
     assert few_photos.table(stored).count("\n") == 3
+    assert few_photos.published_table(stored).count("\n") == 1  # none of them has its rows
+    stored[0]["rows"] |= {"as published": measured("", 20.0, 0.0)["rows"]["two stages"]}
+    stored[0]["rows"] |= {"paper's law, two stages": stored[1]["rows"]["joint"]}
+    (line,) = few_photos.published_table(stored).splitlines()[2:]
+    assert line.startswith("| 4 photos | 1 | 16.00 | 13.00 | 21.00 | +8.00 (+8.00 to +8.00) | +8.00")
 
 
 def test_photos_are_left_out_evenly_with_their_cameras(tmp_path: Path) -> None:
