@@ -73,6 +73,7 @@ def importance_search(
     errors: float,
     floor: float,
     first: Array | None = None,
+    near: bool = False,
     on_generation: Callable[[int, float], None] | None = None,
 ) -> SearchResult:
     """Sample the posterior under a tempered likelihood, exp(-errors / 2 * (cost / scale)^2) with scale the lowest cost.
@@ -90,10 +91,13 @@ def importance_search(
         errors: Number of independent errors in the mean cost.
         floor: Cost of the measurement noise alone, the minimum of the scale.
         first: The first sample (P,); the prior's mean by default.
+        near: Draw the first generation about `first`, half as wide as the prior, in place of from the prior.
         on_generation: Called with the generation and the lowest cost so far.
     """
     rng, size = np.random.default_rng(seed), len(prior.mean)
     proposals = [(prior.mean.astype(float), np.diag(np.square(prior.std)))]
+    if near and first is not None:
+        proposals = [(first.astype(float), np.diag(np.square(prior.std / 2)))]
     samples, found = np.empty((0, size)), np.empty((0, 0))
     history: list[float] = []
     mean, covariance, effective = *proposals[0], 0.0

@@ -63,7 +63,7 @@ class Parameter:
 FRICTION = Parameter(
     name="friction",
     unit="1",
-    bounds=(0.01, 2.0),
+    bounds=(0.001, 2.0),
     logarithmic=True,
     reveals="sliding on the ground",
     prior=(0.3, 0.5),

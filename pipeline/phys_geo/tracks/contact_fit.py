@@ -25,12 +25,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from ....datasets.capture.tracks import Episode, Track
 from ....datasets.io.progress import note
 from ....schemas import FitChoice, InputDataError, PhysConfig
 from ....schemas.materials import of_pair
-from ...optimization.importance_sampling import episode_covariance
+from ...optimization.importance_sampling import SearchResult, episode_covariance
 from ...physics.chains.parameters import chain_parameters
 from ...physics.effects import ActiveEffect, load_effect
 from ...physics.effects.recording import no_recording
@@ -41,6 +43,7 @@ from ...physics.parameters import (
     CONTACT_TIME,
     GROUND_SHIFT,
     Parameter,
+    apply_parameters,
     contact_parameters,
     contact_values,
     effect_parameters,
@@ -57,6 +60,7 @@ from ...segments.impacts.restitution import RestitutionFit, restitution_of
 from ...segments.segments import world_for
 from ...trajectories.initial_state import estimate_states, flight_frames, warmup_frames
 from ...trajectories.observations import Observations
+from ...trajectories.residuals import STATE_SIZE
 from ...trajectories.segmentation import whole_episodes
 from ...trajectories.track_noise import Noise, estimate_noise
 from ..effects.effect_fit import fit_effects
@@ -86,6 +90,9 @@ information."""
 MAX_EPISODES = 100
 """Maximum number of episodes in the search, evenly spread: enough for four parameters, and the slowest step of the
 fit."""
+
+SEARCHES = 6
+"""Maximum number of searches of episodes that begin in contact: each brings a friction a third of the way or more."""
 
 NEVER_TOUCHES = (
     "nothing touches anything in these episodes: the contact parameters keep their {} values; only effects that act "
@@ -379,11 +386,45 @@ def _with_initial_states(world: World, data: _FitData, warmup_s: float) -> Searc
     return SearchBatch(observations, warm, solution.state_cov)
 
 
+def _searched(
+    ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfig, warm_started: bool
+) -> tuple[SearchBatch, SearchResult]:
+    """Return what the search finds, and the episodes with the states from which it did.
+
+    Where bodies slide from the first frame on, their velocities after the warm-up depend on the friction with which
+    they were estimated: they are estimated anew with the one that is found, until they stay.
+    """
+    search = search_contact(ready.world, batch, ready.start, data.noise, config, warm_started)
+    flying = flight_frames(ready.world, batch.observations)[:, 0]
+    glides = not (flying.all() or ready.world.chains or batch.observations.drives)
+    for _ in range(SEARCHES - 1 if glides else 0):
+        values = [p.decode(torch.tensor([value])) for (p, _), value in zip(ready.start, search.mean, strict=True)]
+        names = [p for p, _ in ready.start]
+        again = _with_initial_states(
+            apply_parameters(ready.world, names, torch.stack(values, -1)), data, config.warmup_s
+        )
+        if not _moved(batch, again, flying):
+            break
+        batch = again
+        start = [(p, float(value)) for p, value in zip(names, values, strict=True)]
+        search = search_contact(ready.world, batch, start, data.noise, config, warm_started=True, near=True)
+    return batch, search
+
+
+def _moved(before: SearchBatch, after: SearchBatch, flying: Tensor) -> bool:
+    """Return whether a velocity of an episode that begins in contact is another one, beyond its standard error."""
+    change = (after.observations.state.velocity_m_s - before.observations.state.velocity_m_s).abs()[~flying]
+    free = list(after.observations.free)
+    columns = [STATE_SIZE * column + 6 + axis for column in range(len(free)) for axis in range(3)]
+    std = after.start_cov.diagonal(dim1=1, dim2=2)[~flying][:, columns].clamp_min(0).sqrt()
+    return bool((change[:, free].flatten(1) > std).any())
+
+
 def _contact_estimate(
     ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfig, warm_started: bool, record: FitRecord
 ) -> tuple[ContactEstimate, FitRecord]:
     """Return the contact parameters by the search, refined by shooting where there are few episodes."""
-    search = search_contact(ready.world, batch, ready.start, data.noise, config, warm_started)
+    batch, search = _searched(ready, data, batch, config, warm_started)
     record = replace(record, search_open_loop_m=search.history, search_effective_samples=search.effective_samples)
     covariance = episode_covariance(search, ENOUGH_EPISODES)
     if covariance is not None:

@@ -58,6 +58,7 @@ def search_contact(
     noise: Noise,
     config: PhysConfig,
     warm_started: bool,
+    near: bool = False,
 ) -> SearchResult:
     """Search for the parameters with the lowest open-loop error.
 
@@ -68,6 +69,7 @@ def search_contact(
         noise: Of the tracks (position [m], rotation [rad]).
         config: The stage's settings.
         warm_started: Whether the start comes from an earlier fit, which halves the number of generations.
+        near: Whether the search is of what is near the start, not of all that the priors allow.
 
     Raises:
         NotConvergedError: If the rollouts diverge everywhere.
@@ -93,6 +95,7 @@ def search_contact(
         population=config.population or default_population(episodes, len(names)),
         generations=generations,
         first=np.array([p.encode(value) for p, value in start]),
+        near=near,
         errors=ERRORS_PER_EPISODE * episodes,
         floor=_noise_floor(world, batch.observations, noise),
         on_generation=advance,

@@ -57,6 +57,21 @@ def test_the_first_sample_is_the_given_one_and_none_leaves_the_bounds() -> None:
     assert (found.samples >= PRIOR.bounds[:, 0]).all() and (found.samples <= PRIOR.bounds[:, 1]).all()
 
 
+def far(samples: np.ndarray) -> np.ndarray:
+    """Errors of eight slides by the logarithm of a friction, 5.5 standard deviations from its prior, and two others."""
+    wrong = np.abs(np.exp(samples[:, 0] - 1.0) - np.exp(-3.75)) + 1e-3 * np.abs(samples[:, 1:]).sum(1)
+    return np.tile((1e-3 + wrong)[:, None], (1, 8))
+
+
+def test_a_search_near_its_start_draws_from_there() -> None:
+    prior = NormalPrior(np.zeros(3), np.full(3, 0.5), np.tile([-6.0, 6.0], (3, 1)))
+    words = {"seed": 1, "population": 96, "generations": 3, "errors": 24.0, "floor": 6e-4}
+    start = np.array([-2.4, 0.0, 0.0])
+    wide, near = (importance_search(far, prior, **words, first=start, near=one) for one in (False, True))
+    assert abs(near.mean[0] + 2.75) < 0.1 < abs(wide.mean[0] + 2.75)
+    assert near.samples[:96].mean(0) == pytest.approx(start, abs=0.1)
+
+
 def test_a_generation_in_which_the_model_diverges_teaches_nothing() -> None:
     told: list[tuple[int, float]] = []
 

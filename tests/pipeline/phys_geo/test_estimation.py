@@ -1,6 +1,8 @@
 """Least squares, search and the stage phys-geo: synthetic truth in, parameters out, intervals that cover it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,12 +11,12 @@ from cgwm.datasets import Track
 from cgwm.datasets.capture.tracks import Episode
 from cgwm.pipeline.optimization.importance_sampling import NormalPrior, importance_search
 from cgwm.pipeline.optimization.levenberg_marquardt import minimise
-from cgwm.pipeline.phys_geo.tracks import contact_shooting
+from cgwm.pipeline.phys_geo.tracks import contact_fit, contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_fit import NEVER_TOUCHES, fit_physics
 from cgwm.pipeline.phys_geo.tracks.contact_result import _derived
 from cgwm.pipeline.physics import restitution
 from cgwm.pipeline.physics.engine import rollout as roll_out
-from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS
+from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, FRICTION
 from cgwm.pipeline.trajectories.initial_state import estimate_states, flight_frames, warmup_frames
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise, estimate_noise
@@ -248,3 +250,33 @@ def test_search_begins_at_the_sample_that_it_is_given_once() -> None:
     drawn.clear()
     importance_search(costs, prior, seed=0, population=16, generations=1, errors=9.0, floor=0.01)
     assert drawn[0][0, 0] == 1.0, "the prior's mean where none is given"
+
+
+@pytest.mark.parametrize(("flying", "rounds"), [(False, 4), (True, 1)])
+def test_slides_are_searched_anew_until_their_first_velocities_stay(
+    monkeypatch: pytest.MonkeyPatch, flying: bool, rounds: int
+) -> None:
+    """States by a friction mu0 > mu are too fast, and the search of these finds a friction between the two."""
+    true_mu, searched = 0.03, []
+
+    def states(mu: float) -> Any:
+        velocity = torch.full((8, 1, 3), 1.0 + 0.5 * (mu - true_mu))
+        observations = SimpleNamespace(state=SimpleNamespace(velocity_m_s=velocity), free=(0,), drives={})
+        return SimpleNamespace(observations=observations, start_cov=4e-6 * torch.eye(12).expand(8, -1, -1), mu=mu)
+
+    def search(
+        world: Any, batch: Any, start: Any, noise: Any, config: Any, warm_started: bool, near: bool = False
+    ) -> Any:
+        searched.append((float(start[0][1]), warm_started, near))
+        return SimpleNamespace(mean=np.array([FRICTION.encode(true_mu + 0.2 * (batch.mu - true_mu))]))
+
+    monkeypatch.setattr(contact_fit, "search_contact", search)
+    monkeypatch.setattr(contact_fit, "flight_frames", lambda *_: torch.full((8, 3), flying))
+    monkeypatch.setattr(contact_fit, "apply_parameters", lambda world, names, values: float(values))
+    monkeypatch.setattr(contact_fit, "_with_initial_states", lambda mu, *_: states(mu))
+    ready: Any = SimpleNamespace(world=SimpleNamespace(chains=()), start=[(FRICTION, 0.3)])
+    data: Any = SimpleNamespace(noise=Noise(1e-3, 1e-2))
+    _, found = contact_fit._searched(ready, data, states(0.3), PhysConfig(), False)
+    assert len(searched) == rounds and searched[0] == (0.3, False, False)
+    assert all(again[1:] == (True, True) for again in searched[1:])
+    assert (abs(FRICTION.decode(torch.tensor(found.mean[0])) - true_mu) < 2e-3) == (not flying)
