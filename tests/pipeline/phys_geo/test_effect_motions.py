@@ -120,7 +120,7 @@ def test_a_number_that_windows_hardly_show_ends_on_no_bound() -> None:
     thrown = tosses(world_with("cube"), 5, count=2, duration_s=0.35, noise=(2e-3, 2e-2))
     wanted = [(p, 0.0) for p in effect_parameters(nothing)]
     found = first_contact_fit.fit_first_contacts(nothing, thrown, wanted, values(nothing), NOISE, True, 0.2)
-    assert max(abs(p.estimate) for p in found.parameters) < 0.4  # the bounds are at 1
+    assert max(abs(p.estimate) for p in found.parameters) < 0.8  # the bounds are at 1
 
 
 def test_a_drag_has_no_error_of_the_steps() -> None:
