@@ -48,20 +48,23 @@ def near_surface(placed: Placed, surface: FixedSurface, step_s: Tensor) -> Nearb
     speed = still.velocity.square().sum(-1).sqrt() + still.omega.square().sum(-1).sqrt() * still.reach
     margin = plain(step_s) * speed + 1e-6
     far = fixed.bound(still.reference[:, None]).squeeze(1) - still.reach - margin
-    if not bool((far < 0).any()):
-        return None
-    return _nearby(still, fixed, step_s, margin)
+    return _nearby(still, fixed, step_s) if bool((far < 0).any()) else None
 
 
-def _nearby(still: Placed, fixed: FixedSurface, step_s: Tensor, margin: Tensor) -> Nearby:
+def _nearby(still: Placed, fixed: FixedSurface, step_s: Tensor, within_m: Tensor | None = None) -> Nearby:
+    """Return the contacts within a gap (n,) [m], or those that a step may close; of other surfaces all."""
     chosen = _chosen(still, fixed)
     centers, radii = _spheres(still, chosen)
     if fixed.mesh is None:
         points = _points(fixed, still, centers, radii, None, None)
         return Nearby(_least_gap(points, still, step_s), None, None)
     shape, count = centers.shape[:2], fixed.contacts_per_sphere
+    if within_m is None:  # no gap of a sphere changes by more in a step, up to rounding
+        margin = plain(step_s)[:, None] * still.point_velocity(centers).square().sum(-1).sqrt() + 1e-6
+    else:
+        margin = within_m[:, None].expand(shape)
     distance, feature = fixed.mesh.features(
-        fixed.local(centers).flatten(0, 1), radii.expand(shape).flatten(), margin[:, None].expand(shape).flatten()
+        fixed.local(centers).flatten(0, 1), radii.expand(shape).flatten(), margin.flatten()
     )
     feature, there = (x.unflatten(0, shape).flatten(1) for x in (feature, torch.isfinite(distance)))
     inside = (distance < 0).unflatten(0, shape).flatten(1)

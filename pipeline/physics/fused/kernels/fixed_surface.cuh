@@ -301,13 +301,14 @@ INLINE Number least_distance(const Problem& problem, const Fixed& fixed, int s, 
 }
 
 // Finds one slot of a body with a surface: the distance of the sphere's centre and the normal, in the kernel's frame.
-// Returns false for a slot of a mesh without a contact.
+// Returns false for a slot of a mesh without a contact within a step; without a motion, without one at all.
 __device__ bool meet(const Problem& problem, const Environment& env, const Fixed& fixed, int p, int k,
-                     const Mat& rotation, Number margin, Searched& searched, Vec& center, Real& radius,
+                     const Mat& rotation, const Motion* motion, Searched& searched, Vec& center, Real& radius,
                      Meeting& meeting) {
     int a = pair_a(p), s = -2 - pair_b(p);
     long long row = env.geometry + 4LL * problem.spheres[contact_start(p) + k];
-    center = env.bodies[a].position + rotation * (problem.geometry.vector(row) - env.constants[a].com);
+    const Vec arm = rotation * (problem.geometry.vector(row) - env.constants[a].com);
+    center = env.bodies[a].position + arm;
     radius = problem.geometry.at(row + 3);
     Vec at = transposed(fixed.rotation, center - fixed.position);
 #if MESHES
@@ -315,6 +316,9 @@ __device__ bool meet(const Problem& problem, const Environment& env, const Fixed
         TriangleMesh m = triangle_mesh(problem, s);
         if (k / MESH_CONTACTS != searched.sphere) {
             Point local = {plain(at.x), plain(at.y), plain(at.z)};
+            // no gap of the sphere changes by more in a step, up to rounding
+            Number margin = Number(0);
+            if (motion) margin = plain(env.laws[0].step_s) * size(motion->velocity + cross(motion->omega, arm)) + Number(1e-6);
             find(m, local, plain(radius), margin, searched);
             searched.sphere = k / MESH_CONTACTS;
         }

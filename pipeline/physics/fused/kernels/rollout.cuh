@@ -201,7 +201,7 @@ INLINE void write_labels(const Problem& problem, Environment& env, Own& own, int
                 Meeting meeting;
                 const Mat& turn = rotations[a];
                 Fixed fixed = fixed_surface(problem, env, -2 - pair_b(p));
-                if (meet(problem, env, fixed, p, k, turn, Number(0), searched, center, radius, meeting)) {
+                if (meet(problem, env, fixed, p, k, turn, nullptr, searched, center, radius, meeting)) {
                     gap = meeting.distance - radius;
                     normal = meeting.outward;
                     point = center - radius * normal;

@@ -88,7 +88,7 @@ INLINE bool meet_surface(const Problem& problem, const Environment& env, const F
     Vec center;
     Real radius;
     Meeting meeting;
-    if (!meet(problem, env, fixed, p, k, rotations[a], margin, searched, center, radius, meeting)) return false;
+    if (!meet(problem, env, fixed, p, k, rotations[a], &m, searched, center, radius, meeting)) return false;
     Real gap = meeting.distance - radius;
     if (!(plain(gap) < margin)) return false;
     c.normal = meeting.outward;
