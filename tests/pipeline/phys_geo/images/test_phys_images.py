@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -12,12 +13,13 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.datasets.models.model import Model
 from cgwm.pipeline.geometry.rotation import geodesic_angle, quat_to_matrix
 from cgwm.pipeline.geometry.spheres import Spheres
-from cgwm.pipeline.phys_geo.images import end_to_end, pose_tracking
+from cgwm.pipeline.phys_geo.images import end_to_end, image_fit, pose_tracking
 from cgwm.pipeline.phys_geo.images.coarse_spheres import coarse_model, merged
 from cgwm.pipeline.phys_geo.images.contact_spheres import ContactSpheres
 from cgwm.pipeline.phys_geo.images.end_to_end import ImageObjective, TrackTerm, refine_end_to_end
 from cgwm.pipeline.phys_geo.images.image_fit import fit_physics_from_images
 from cgwm.pipeline.phys_geo.images.image_loss import ImageLoss
+from cgwm.pipeline.phys_geo.images.image_problem import ImageProblem
 from cgwm.pipeline.phys_geo.images.pose_search import rotation_grid
 from cgwm.pipeline.phys_geo.images.pose_tracking import PoseTracker
 from cgwm.pipeline.phys_geo.images.video_frames import Footage, Video, load_footage
@@ -237,6 +239,20 @@ def test_refinement_lowers_the_image_loss_and_never_raises_it(scene: tuple[Model
     moved = objective.rollout(refined.shared, refined.states).position_m[0]
     before = objective.rollout(shared, states).position_m[0]
     assert (moved - rollout.position_m[0]).norm() < 0.5 * (before - rollout.position_m[0]).norm()
+
+
+@pytest.mark.parametrize("law", ["closed_form", "paper"])
+def test_images_move_the_friction_under_the_published_law_alone(
+    scene: tuple[Model, World, Rollout], law: Literal["closed_form", "paper"]
+) -> None:
+    model, _, rollout = scene
+    shared = TRUTH + torch.tensor([0.2, -0.3], dtype=torch.float64)
+    problem = ImageProblem(objective_of(scene, film(model, rollout)), shared, "known")
+    config = PhysConfig(supervise="images", device="cpu", contact_law=law, iterations=1)
+    moved = image_fit._refine(problem, np.eye(2), config).shared - shared
+    friction, damping_ratio = moved.abs().tolist()
+    assert damping_ratio > 1e-3
+    assert friction > 1e-3 if law == "paper" else friction == 0
 
 
 def test_cameras_with_a_time_offset_share_one_time_line(scene: tuple[Model, World, Rollout]) -> None:
