@@ -1,5 +1,7 @@
 """Detection of episodes that begin while something carries or pushes the body: its acceleration steps at the release.
 
+Backwards in time the same shows flights that end in a hand or a net, which slows the body down.
+
 Until the release at t_r a body has an acceleration that its free motion has not: x(t) = p(t) + A (t_r - t)^2 / 2 for
 t < t_r, with a polynomial p of second degree and continuous velocity. What holds a body still carries its weight, and a
 hand that throws it does more, so A is of the size of gravity and points up; effects of air, wind or tilt have no step
@@ -79,7 +81,19 @@ def carried_starts(world: World, whole: Observations, noise: Noise) -> dict[int,
         whole: The episodes.
         noise: Standard deviations of the tracks (position [m], rotation [rad]).
     """
-    begun = list(_beginnings(world, whole, noise)) if len(world.bodies) == 1 else []
+    return _free_frames(world, list(_beginnings(world, whole, noise)) if len(world.bodies) == 1 else [])
+
+
+def carried_ends(world: World, whole: Observations, noise: Noise) -> dict[int, int]:
+    """Return the last free frame of each episode that ends in the air while something slows the body, by index.
+
+    Arguments as of `carried_starts`.
+    """
+    return _free_frames(world, list(_ends(world, whole, noise)) if len(world.bodies) == 1 else [])
+
+
+def _free_frames(world: World, begun: Sequence[Beginning]) -> dict[int, int]:
+    """Return the first free frame of each beginning with a step of acceleration, by index of the episode."""
     if not begun:
         return {}
     least = LIMITS.weights * float(world.gravity.norm())
@@ -120,6 +134,22 @@ def _beginnings(world: World, whole: Observations, noise: Noise) -> Iterator[Beg
             places = places - (places @ across)[:, None] * across
         since = (times[frames] - times[frames[0]]).astype(np.float64)
         yield Beginning(episode=episode, frames=frames, times_s=since, places_m=places, airborne=airborne, up=up)
+
+
+def _ends(world: World, whole: Observations, noise: Noise) -> Iterator[Beginning]:
+    """Yield the last frames of the episodes that end in the air, backwards in time."""
+    clear = clear_frames(world, whole, noise).numpy(force=True)
+    for episode, times in enumerate(whole.times_s.numpy(force=True)):
+        seen = np.nonzero(whole.seen[episode, :, 0].numpy(force=True) > 0)[0][::-1]
+        touched = np.nonzero(~clear[episode, seen])[0]
+        frames = seen[: touched[0]] if len(touched) else seen
+        frames = frames[times[seen[0]] - times[frames] <= LIMITS.window_s] if len(seen) else frames
+        if len(frames) < LIMITS.least_frames:
+            continue
+        places = whole.position_m[episode, frames, 0].numpy(force=True).astype(np.float64)
+        since = (times[frames[0]] - times[frames]).astype(np.float64)
+        # what slows it down pulls it back to where it came from
+        yield Beginning(episode=episode, frames=frames, times_s=since, places_m=places, airborne=False, up=np.zeros(3))
 
 
 def _step(one: Beginning, width_s: float) -> Step:

@@ -22,10 +22,10 @@ from ..trajectories.segmentation import Segment, cut_episodes, supported_frames,
 from ..trajectories.smoothing_filter import SmoothingFilter, smoothing_filter
 from ..trajectories.time_errors import time_errors, time_shifts
 from ..trajectories.track_noise import Noise, noise_of
-from .carried_starts import carried_starts
+from .carried_starts import carried_ends, carried_starts
 from .contact_phases import is_round
 from .flights.residual_wrench import ResidualWrenches, wrench_windows
-from .release_detection import held_starts, release_warnings, without_held
+from .release_detection import catch_warnings, held_starts, release_warnings, without_caught, without_held
 from .segment_states import fit_states
 from .segments import Kind, Segments
 from .thresholds import SEGMENT_THRESHOLDS
@@ -67,6 +67,8 @@ class Prepared:
     released_s: Mapping[str, float] = field(default_factory=dict)
     """Time [s] from which an episode that begins in a hand flies freely, by name; earlier frames count as not
     measured."""
+    caught: dict[int, int] = field(default_factory=dict)
+    """Last free frame of the episodes, by index, that end in a hand or a net."""
     noise_model: NoiseModel = WHITE
     """Correlation of the errors in time."""
     left_out_s: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -227,6 +229,8 @@ class _State:
     """Number of frames removed as wrong measurements."""
     held: dict[int, int] = field(default_factory=dict)
     """First free frame of the episodes, by index, that begin in a hand."""
+    caught: dict[int, int] = field(default_factory=dict)
+    """Last free frame of the episodes, by index, that end in a hand or a net."""
     noise_model: NoiseModel = WHITE
     """Correlation of the errors in time."""
     time_error_s: float = 0.0
@@ -250,6 +254,9 @@ class _State:
         every = whole_episodes(world, episodes)
         held = {} if world.chains else carried_starts(world, every, noise)
         whole = without_held(every, held)
+        caught = {} if world.chains else carried_ends(world, whole, noise)
+        warnings = catch_warnings(episodes, whole, caught)
+        whole = without_caught(whole, caught)
         nothing = torch.zeros_like(whole.seen[..., 0], dtype=torch.bool)
         return _State(
             world=world,
@@ -257,6 +264,8 @@ class _State:
             noise=noise,
             observations=whole,
             held=held,
+            caught=caught,
+            warnings=warnings,
             oriented=bool(whole.has_orientation.any()),
             airborne=nothing,
             supported=nothing,
@@ -343,7 +352,8 @@ def _left_out(state: _State, world: World, episodes: Sequence[Episode]) -> dict[
     """Return the times [s] of frames of which a position or turn is left out as wrong, by name of the episode."""
     if not state.outliers:
         return {}
-    before, after = without_held(whole_episodes(world, episodes), state.held), state.observations
+    before = without_caught(without_held(whole_episodes(world, episodes), state.held), state.caught)
+    after = state.observations
     pairs = ((before.seen, after.seen), (before.has_orientation, after.has_orientation))
     lost = torch.stack([((old > 0) & (new <= 0)).any(-1) for old, new in pairs]).any(0)
     times = {name: tuple(after.times_s[k, lost[k]].tolist()) for k, (name, _) in enumerate(episodes)}

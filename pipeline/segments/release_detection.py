@@ -23,7 +23,7 @@ from ...datasets.capture.tracks import Episode
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, cut_episodes, whole_episodes
 from ..trajectories.track_noise import noise_of
-from .carried_starts import carried_starts
+from .carried_starts import carried_ends, carried_starts
 from .segment_states import fit_states
 from .segments import Segments
 from .thresholds import SEGMENT_THRESHOLDS
@@ -92,12 +92,16 @@ def find_releases(
 def from_releases(
     world: World, episodes: Sequence[Episode], noise: tuple[float | None, float | None]
 ) -> tuple[list[Episode], list[str]]:
-    """Return the episodes, those that begin in a hand from their releases on, and warnings about these.
+    """Return the episodes without what begins or ends in a hand or a net, and warnings about these.
 
     Jointed bodies have none: the detection takes the flight of a single body. Arguments as of `find_releases`.
     """
-    released_s, warnings = ({}, []) if world.chains else find_releases(world, episodes, noise)
-    return after_release(episodes, released_s), warnings
+    if world.chains:
+        return list(episodes), []
+    released_s, warnings = find_releases(world, episodes, noise)
+    freed = after_release(episodes, released_s)
+    caught_s, said = find_catches(world, freed, noise)
+    return after_release(freed, {}, caught_s), [*warnings, *said]
 
 
 def without_held(whole: Observations, held: Mapping[int, int]) -> Observations:
@@ -108,10 +112,51 @@ def without_held(whole: Observations, held: Mapping[int, int]) -> Observations:
     return replace(whole, seen=seen, has_orientation=turned)
 
 
-def after_release(episodes: Iterable[Episode], released_s: Mapping[str, float]) -> list[Episode]:
-    """Return the episodes cut to start at their release times [s], where they have one."""
+def find_catches(
+    world: World, episodes: Sequence[Episode], noise: tuple[float | None, float | None]
+) -> tuple[dict[str, float], list[str]]:
+    """Return the last free times [s] of episodes that end in a hand or a net, by name, and warnings about them.
+
+    Arguments as of `find_releases`.
+    """
+    free = [world.bodies[k].name for k in world.free]
+    whole = whole_episodes(world, episodes)
+    std = noise_of(noise, [tracks[name] for _, tracks in episodes for name in free if name in tracks])
+    caught = carried_ends(world, whole, std)
+    return {episodes[k][0]: float(whole.times_s[k, last]) for k, last in caught.items()}, catch_warnings(
+        episodes, whole, caught
+    )
+
+
+def without_caught(whole: Observations, caught: Mapping[int, int]) -> Observations:
+    """Return the episodes with the frames after each last free one (`caught`, by episode) marked as not measured."""
+    seen, turned = whole.seen.clone(), whole.has_orientation.clone()
+    for episode, last in caught.items():
+        seen[episode, last + 1 :], turned[episode, last + 1 :] = 0.0, 0.0
+    return replace(whole, seen=seen, has_orientation=turned)
+
+
+def catch_warnings(episodes: Sequence[Episode], whole: Observations, caught: Mapping[int, int]) -> list[str]:
+    """Return a warning for each episode that ends in a hand or a net (`caught`: last free frames, by index)."""
+    said = []
+    for episode, last in caught.items():
+        times = whole.times_s[episode, whole.seen[episode].amax(-1) > 0]
+        at = float(whole.times_s[episode, last])
+        said.append(
+            f"episode '{episodes[episode][0]}' ends in a hand or a net: for the last "
+            f"{1e3 * (float(times[-1]) - at):.0f} ms something slows the body down. These frames are left out; end the "
+            f"recording there ([episodes] end_s in capture.toml: {at:.3f} on the track's clock)."
+        )
+    return said
+
+
+def after_release(
+    episodes: Iterable[Episode], released_s: Mapping[str, float], caught_s: Mapping[str, float] | None = None
+) -> list[Episode]:
+    """Return the episodes cut to start at their release times [s] and to end at their catches, where they have one."""
+    ends = caught_s or {}
     return [
-        Episode(name, {body: track.window(released_s.get(name)) for body, track in tracks.items()})
+        Episode(name, {body: track.window(released_s.get(name), ends.get(name)) for body, track in tracks.items()})
         for name, tracks in episodes
     ]
 

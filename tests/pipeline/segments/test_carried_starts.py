@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cgwm.datasets.capture.tracks import Track
-from cgwm.pipeline.segments.carried_starts import Beginning, _shape, _step, carried_starts
-from cgwm.pipeline.segments.release_detection import find_releases
+from cgwm.pipeline.segments.carried_starts import Beginning, _shape, _step, carried_ends, carried_starts
+from cgwm.pipeline.segments.release_detection import find_releases, from_releases
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.diagnosis_data import tosses, world_with
@@ -54,6 +54,36 @@ def test_what_acts_all_along_the_flight_carries_nothing(effects: Mapping[str, Ma
 def test_a_step_down_is_the_rounded_beginning_of_an_impact() -> None:
     world = world_with("ball")
     assert carried_starts(world, whole_episodes(world, carried(thrown(), -20.0 * UP)), NOISE) == {}
+
+
+def caught(episodes: Episodes, frames: int, slowing_1_s: float) -> Episodes:
+    """All tosses with a net or a hand that slows the body down over the last frames."""
+    found = []
+    for name, tracks in episodes:
+        ((body, track),) = tracks.items()
+        place, last = track.position_m.copy(), len(track) - 1 - frames
+        velocity = (place[last] - place[last - 4]) / (track.time_s[last] - track.time_s[last - 4])
+        since = track.time_s[last:, None] - track.time_s[last]
+        place[last:] = place[last] + velocity * (1 - np.exp(-slowing_1_s * since)) / slowing_1_s
+        found.append((name, {body: replace(track, position_m=place)}))
+    return found
+
+
+@pytest.mark.parametrize("slowing", [20.0, 60.0])
+def test_what_ends_in_a_net_or_a_hand_is_left_out(slowing: float) -> None:
+    world = world_with("ball")
+    tracks, warnings = from_releases(world, caught(thrown(), 10, slowing), (None, None))
+    free = [len(own["ball"]) for _, own in thrown()]
+    assert all(-3 <= len(own["ball"]) - (count - 10) <= 1 for (_, own), count in zip(tracks, free, strict=True))
+    assert len(warnings) == 6 and "ends in a hand or a net: for the last" in warnings[0]
+
+
+@pytest.mark.parametrize(
+    "effects", [{}, {"quadratic_drag": {"k": 0.3}}, {"magnus_lift": {"s": 0.02}}, {"gravity_scale": {"s": 0.2}}]
+)
+def test_a_flight_that_ends_in_the_air_was_not_caught(effects: Mapping[str, Mapping[str, float]]) -> None:
+    world = world_with("ball")
+    assert carried_ends(world, whole_episodes(world, thrown(effects)), NOISE) == {}
 
 
 @pytest.mark.parametrize("width_s", [0.0, 0.01, 0.03])
