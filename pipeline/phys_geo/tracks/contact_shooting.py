@@ -19,7 +19,7 @@ from ...trajectories.track_noise import Noise
 from .contact_result import ContactEstimate, ShootingRecord
 from .multiple_shooting import Shooting, ShootingFit, ShootingPrior
 from .open_loop_search import SEVERAL_EPISODES, SearchBatch, open_loop_errors
-from .tempered_posterior import tempered
+from .tempered_posterior import tempered, with_friction_law_error
 
 OPEN_LOOP_TOLERANCE = 8.0
 """Maximum ratio of the open-loop error of shooting to that of the search, for bodies that nothing drives; above it the
@@ -84,6 +84,7 @@ def shoot_contact(
     )
     shot = shots[0]
     shared, covariance, growth = tempered(shot, prior, MODEL_EXCESS)
+    covariance = with_friction_law_error(covariance, parameters)
     errors = open_loop_errors(world, data.batch.observations, data.batch.warm, parameters)
     cost = float(errors(shared[None]).mean())
     finite = math.isfinite(shot.cost) and math.isfinite(cost)

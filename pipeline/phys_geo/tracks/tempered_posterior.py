@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from ...physics.parameters import FRICTION, Parameter, base_name
 from .multiple_shooting import ShootingFit, ShootingPrior
+
+FRICTION_LAW_STD = 0.1
+"""Standard deviation of the logarithm of a friction that the law of contact makes itself, common to a whole motion: no
+misfit shows it, and no further frame makes it smaller. It is that of what MuJoCo (cone and pyramid), Drake, DART and
+Rapier state, from one motion of each of 127 captures with true shape and mass: 113 intervals held without it, 119 with
+it (likeliest 0.09, least interval score at 0.12)."""
 
 
 def tempered(shot: ShootingFit, prior: ShootingPrior, excess: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -39,3 +48,9 @@ def tempered(shot: ShootingFit, prior: ShootingPrior, excess: float) -> tuple[np
     pulled = (information @ ended + prior_information @ (ended - middle)) / growth + prior_information @ middle
     low, high = prior.bounds.numpy().T
     return (covariance @ pulled).clip(low, high), covariance, growth
+
+
+def with_friction_law_error(covariance: np.ndarray, parameters: Sequence[Parameter]) -> np.ndarray:
+    """Return a covariance (P, P) of parameters with the error that the law of contact makes in each friction."""
+    frictions = np.array([base_name(parameter.name) == FRICTION.name for parameter in parameters], float)
+    return covariance + np.diag(FRICTION_LAW_STD**2 * frictions)

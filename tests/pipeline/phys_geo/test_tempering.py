@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.phys_geo.tracks.multiple_shooting import ShootingFit, ShootingPrior
-from cgwm.pipeline.phys_geo.tracks.tempered_posterior import tempered
+from cgwm.pipeline.phys_geo.tracks.tempered_posterior import FRICTION_LAW_STD, tempered, with_friction_law_error
+from cgwm.pipeline.physics.parameters import CONTACT_TIME, FRICTION
 from cgwm.pipeline.physics.state import State
 
 F64 = torch.float64
@@ -73,3 +76,11 @@ def test_data_without_information_leave_the_prior() -> None:
 def test_bounds_hold() -> None:
     tight = ShootingPrior(PRIOR.mean, PRIOR.std, torch.tensor([[-9.0, 9.0], [0.97, 9.0]], dtype=F64))
     assert tempered(ended(DATA, misfit=1.0), tight, EXCESS)[0][1] >= 0.97
+
+
+def test_frictions_alone_have_the_error_of_the_law() -> None:
+    pair = replace(FRICTION, name="friction[fingertip,object]")
+    covariance = np.array([[0.04, 0.01, 0.02], [0.01, 0.09, 0.0], [0.02, 0.0, 0.16]])
+    wider = with_friction_law_error(covariance, [FRICTION, CONTACT_TIME, pair])
+    law = FRICTION_LAW_STD**2
+    assert wider == pytest.approx(covariance + np.diag([law, 0.0, law]))
