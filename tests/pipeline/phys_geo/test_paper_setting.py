@@ -12,6 +12,7 @@ from cgwm.pipeline.control.task_world import require_rigid
 from cgwm.pipeline.diagnose import stage
 from cgwm.pipeline.phys_geo.paper_setting import paper_config
 from cgwm.pipeline.physics import ContactLaw, PaperLaw, world_of_model
+from cgwm.pipeline.physics.paper_law import stable_step
 from cgwm.pipeline.physics.parameters import apply_parameters, contact_parameters
 from cgwm.schemas import Body, CaptureManifest, Ground, InputDataError, Material, PhysConfig, UsageError
 from cgwm.schemas import World as Surroundings
@@ -67,6 +68,15 @@ def test_parts_that_assume_our_law_are_left_out_or_refused() -> None:
     ):
         with pytest.raises(UsageError, match=f"phys-geo.contact_law=paper with {named}: the paper has one law"):
             paper_config(small_model().file, given, PAPER.model_copy(update=change))
+
+
+def test_its_steps_are_short_enough_for_flat_sides_unless_others_are_asked_for() -> None:
+    step_s = paper_config(small_model().file, capture(), PAPER).step_s
+    one = torch.ones(1, dtype=torch.float64)
+    law = PaperLaw.of_body(0.5 * one, 0.01 * one, 1.8 * one, MASS, 9.81 * MASS)
+    assert 0.9 * step_s < float(stable_step(law, MASS * one, 80 * 4)) < 4 * step_s
+    asked = PhysConfig(contact_law="paper", step_s=0.002)
+    assert paper_config(small_model().file, capture(), asked).step_s == 0.002
 
 
 def test_an_unknown_law_is_refused_with_the_two_there_are() -> None:

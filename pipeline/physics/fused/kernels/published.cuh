@@ -171,6 +171,155 @@ struct Acting {  // impulse of the contacts of a pair on a, and its moments abou
     Vec linear, angular_a, angular_b;
 };
 
+#if HOST && !SINGLE && defined(__AVX__) && !defined(__clang__) && !WIDE && LANES == 1 && (PAIRED || DUAL)
+#define ABREAST 1  // spheres of a body, in places of vectors: where rollouts are not
+#else
+#define ABREAST 0
+#endif
+
+#if ABREAST
+typedef double Lot __attribute__((vector_size(64)));
+typedef long long LotWhole __attribute__((vector_size(64)));
+
+struct Part {  // numbers of eight spheres, with their derivatives
+    Lot value;
+#if DUAL
+    Lot tangent;
+#define PART(value, tangent) {value, tangent}
+#else
+#define PART(value, tangent) {value}
+#endif
+};
+INLINE Part part(Real x) {
+#if DUAL
+    Part p = {Lot{} + x.value, Lot{} + x.tangent};
+#else
+    Part p = {Lot{} + x};
+#endif
+    return p;
+}
+INLINE Part operator+(const Part& a, const Part& b) { Part p = PART(a.value + b.value, a.tangent + b.tangent); return p; }
+INLINE Part operator-(const Part& a, const Part& b) { Part p = PART(a.value - b.value, a.tangent - b.tangent); return p; }
+INLINE Part operator*(const Part& a, const Part& b) {
+    Part p = PART(a.value * b.value, a.tangent * b.value + a.value * b.tangent);
+    return p;
+}
+INLINE Real sum_of(const Part& p) {
+    Real sum = Real(0);
+    for (int k = 0; k < 8; k++) {
+#if DUAL
+        sum += Real(p.value[k], p.tangent[k]);
+#else
+        sum += p.value[k];
+#endif
+    }
+    return sum;
+}
+INLINE bool any_of(LotWhole marks) {
+    long long found = 0;
+    for (int k = 0; k < 8; k++) found |= marks[k];
+    return found != 0;
+}
+
+struct Parts {
+    Part x, y, z;
+    INLINE Parts() : x(part(Real(0))), y(x), z(x) {}
+    INLINE Parts(const Part& x, const Part& y, const Part& z) : x(x), y(y), z(z) {}
+    INLINE explicit Parts(const Vec& v) : x(part(v.x)), y(part(v.y)), z(part(v.z)) {}
+};
+INLINE Parts operator+(const Parts& a, const Parts& b) { return Parts(a.x + b.x, a.y + b.y, a.z + b.z); }
+INLINE Parts operator-(const Parts& a, const Parts& b) { return Parts(a.x - b.x, a.y - b.y, a.z - b.z); }
+INLINE Parts operator*(const Part& s, const Parts& a) { return Parts(s * a.x, s * a.y, s * a.z); }
+INLINE Part dot(const Parts& a, const Parts& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+INLINE Parts cross(const Parts& a, const Parts& b) {
+    return Parts(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
+}
+INLINE Vec sum_of(const Parts& p) { return vec(sum_of(p.x), sum_of(p.y), sum_of(p.z)); }
+
+// As `clamped`.
+INLINE Part clamped(const Published& p, const Part& gap) {
+    if (!(p.clamp_per_m > 0)) return gap;
+    const Part far = gap + part(Real(p.zero_m)), deep = far + part(Real(p.clamp_depth_m));
+    Lot e;
+    const Lot value = logistic<Lot, LotWhole>(p.clamp_per_m * far.value, e);
+    const Part inside = PART(value, p.clamp_per_m * far.tangent * value * (1.0 - value));
+    return inside * deep - part(Real(p.clamp_depth_m));
+}
+
+// As `softened`.
+INLINE Part softened(const Part& force, double sharpness) {
+    if (!(sharpness > 0)) {
+        const LotWhole pushes = force.value >= 0.0;
+        Part p = PART(pushes ? force.value : Lot{}, pushes ? force.tangent : Lot{});
+        return p;
+    }
+    const Lot exponent = sharpness * force.value;
+    const LotWhole linear = exponent > LINEAR;
+    Lot slope;
+    const Lot soft = soft_plus<Lot, LotWhole>(exponent, slope) / sharpness;
+    Part p = PART(linear ? force.value : soft, linear ? force.tangent : force.tangent * slope);
+    return p;
+}
+
+// Adds the impulses of a body's spheres with the ground.
+INLINE void push_ground(const Problem& problem, const Environment& env, const Own&, int p, const Mat& rotation,
+                        const Motion& m, Acting& sum) {
+    const int a = pair_a(p), start = contact_start(p), count = contact_count(p);
+    const Law& law = env.laws[0];
+    Vec up = vec(Real(0), Real(0), Real(1)), first = vec(Real(1), Real(0), Real(0)), second = vec(Real(0), Real(1), Real(0));
+#if TURNED
+    tangents(env, up, first, second);
+#endif
+    // no point of the body sinks further in this step, up to rounding
+    const double fall = size(m.velocity) + size(m.omega) * env.constants[a].reach;
+    const double far = plain(law.step_s) * fall + 1e-6;
+    const Parts x(rotation.x), y(rotation.y), z(rotation.z), com(env.constants[a].com), v(m.velocity), omega(m.omega);
+    const Parts one(first), two(second);
+    const Part height = part(env.bodies[a].position.z - env.ground), h = part(law.step_s), friction = part(law.friction);
+    const Part stiffness = part(law.stiffness), damping = part(law.damping);
+    Parts linear, angular;
+    for (int k = 0; k < count; k += 8) {
+        Part at[4] = {};
+        for (int j = 0; j < 8; j++) {
+            const Place row = env.geometry + 4LL * problem.spheres[start + (k + j < count ? k + j : count - 1)];
+            for (int c = 0; c < 4; c++) {
+                const Real number = problem.geometry.at(row + c);
+#if DUAL
+                at[c].value[j] = number.value;
+                at[c].tangent[j] = number.tangent;
+#else
+                at[c].value[j] = number;
+#endif
+            }
+        }
+        const Parts held = Parts(at[0], at[1], at[2]) - com;
+        const Part low = dot(z, held) - at[3], gap = height + low;
+        if (!any_of(gap.value <= far)) continue;
+        const Parts arm(dot(x, held), dot(y, held), low), velocity = v + cross(omega, arm);
+        const LotWhole places = {0, 1, 2, 3, 4, 5, 6, 7};
+        const LotWhole closed = (gap.value < 0.0) | (gap.value + h.value * velocity.z.value < 0.0);
+        const LotWhole on = closed & (places < (long long)(count - k));
+        if (!any_of(on)) continue;
+        const Part distance = clamped(env.published, gap), along_one = dot(velocity, one), along_two = dot(velocity, two);
+        Part normal = part(Real(0)), across = normal, beside = normal;
+        for (int d = 0; d < PUBLISHED; d++) {
+            const Part facing = part(Real(facet_x(d))), other = part(Real(facet_y(d)));
+            const Part along = velocity.z - friction * (facing * along_one + other * along_two);
+            const Part force = part(Real(0)) - stiffness * (h * along + distance) - damping * along;
+            const Part all = h * softened(force, env.published.softplus_per_n);
+            const Part impulse = PART(on ? all.value : Lot{}, on ? all.tangent : Lot{});
+            normal = normal + impulse;
+            across = across - facing * impulse;
+            beside = beside - other * impulse;
+        }
+        const Parts impulse = normal * Parts(up) + (friction * across) * one + (friction * beside) * two;
+        linear = linear + impulse;
+        angular = angular + cross(arm, impulse);
+    }
+    sum.linear = sum.linear + sum_of(linear);
+    sum.angular_a = sum.angular_a + sum_of(angular);
+}
+#else
 // Adds the impulses of a body's spheres with the ground.
 INLINE void push_ground(const Problem& problem, const Environment& env, const Own& own, int p, const Mat& rotation,
                         const Motion& m, Acting& sum) {
@@ -207,6 +356,7 @@ INLINE void push_ground(const Problem& problem, const Environment& env, const Ow
         sum.angular_a = sum.angular_a + cross(arm, impulse);
     }
 }
+#endif
 
 #if PAIRED
 // Bound on how far the smooth distance from a body lies below that of its nearest sphere.
