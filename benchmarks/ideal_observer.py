@@ -15,7 +15,9 @@ nameable, too: no rule that seldom names anything wrong can have much more.
 `best` is sharper, and asks for no count of standard errors: an observer who knows, beside the errors, that one effect
 of the library or none is hidden, how sizes are drawn (log-uniform over three decades) and that half of all captures
 hide nothing, names the class whose probability, given the flights, is above 95 %. `best` is the share of draws of the
-errors in which that is the class of the true effect. Nothing that is in no library confuses this observer.
+errors in which that is the class of the true effect. Nothing that is in no library confuses this observer. Of a pair
+`best` is the same for both: the observer knows that none, one or two effects are hidden, each as likely, the two of no
+common family, and names two classes whose probability together is above 95 %.
 
 `errors` are those of the test split, as `missing_effects.py` has them, with the fitted model before, and with the true
 effects at their true numbers added: what no diagnosis can be better than, but by chance.
@@ -31,6 +33,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +56,9 @@ from cgwm.schemas.model import EffectModel
 from diagnose import base_settings, errors_of_test, first_contacts
 from real_like import STAGES
 from real_like.errors import Errors, slow_correlation
+from real_like.plan import FAMILIES
 from real_like.score import EQUIVALENT, RIGHT, judge, rate, ratio_of
+from render_results import record
 from scipy.special import log_ndtr
 from store import ROOT
 
@@ -210,6 +215,57 @@ def best_recall(found: Seen, effect: dict[str, Any], nonnegative: frozenset[str]
     return float(np.mean(right & (sure.max(0) > SURE)))
 
 
+def best_pair_recall(found: Seen, effects: Sequence[dict[str, Any]]) -> float:
+    """Return how often an observer who knows how effects are drawn is sure of the classes of two true ones, and right.
+
+    That some numbers are not negative is not used.
+
+    Args:
+        found: What the flights show.
+        effects: The two true effects.
+    """
+    true = np.sum([_true(found, effect) for effect in effects], axis=0)
+    values, vectors = np.linalg.eigh(found.information)
+    errors = np.random.default_rng(0).standard_normal((DRAWS, len(true)))
+    score = found.information @ true + errors @ (vectors * np.sqrt(values.clip(0.0))).T
+    names = [name for name in dict.fromkeys(found.names) if name in EFFECTS]
+    pairs = [(a, b) for a, b in combinations(names, 2) if not any({a, b} <= family for family in FAMILIES)]
+    sets = [(), *((name,) for name in names), *pairs]
+    counts = {number: sum(len(one) == number for one in sets) for number in range(3)}
+    logs = np.stack([_log_evidence_of(found, score, one) - np.log(counts[len(one)]) for one in sets])
+    share = np.exp(logs - np.logaddexp.reduce(logs, 0))
+    classes = [{one} for one in names] + [set(group) & set(names) for group in EQUIVALENT]
+    sure, right = np.zeros(DRAWS), np.zeros(DRAWS, bool)
+    for first, second in combinations([group for group in classes if group], 2):
+        inside = [len(one) == 2 and _fall_into(one, first, second) for one in sets]
+        together = share[inside].sum(0)
+        better = together > sure * (1 + 1e-9)  # single effects before their class, where they are alike
+        sure = np.where(better, together, sure)
+        right = np.where(better, _fall_into([effect["name"] for effect in effects], first, second), right)
+    return float(np.mean(right & (sure > SURE)))
+
+
+def _fall_into(two: Sequence[str], first: set[str], second: set[str]) -> bool:
+    """Return whether one of two effects is of one class and the other of the other."""
+    a, b = two
+    return (a in first and b in second) or (b in first and a in second)
+
+
+def _log_evidence_of(found: Seen, score: Array, names: Sequence[str]) -> Array:
+    """Return the logarithm of the likelihood of effects of unknown sizes against none, for scores (D, P), as (D)."""
+    if not names:
+        return np.zeros(len(score))
+    own = [[k for k, other in enumerate(found.names) if other == name] for name in names]
+    places, logs = [k for one in own for k in one], []
+    sizes = SIZES if len(names) == 1 else SIZES[::2]
+    for some in product(sizes, repeat=len(names)):
+        width = np.concatenate([size * found.width[one] for size, one in zip(some, own, strict=True)])
+        matrix = np.eye(len(places)) + found.information[np.ix_(places, places)] * np.outer(width, width)
+        along = np.linalg.solve(np.linalg.cholesky(matrix), (score[:, places] * width).T)
+        logs.append(0.5 * np.square(along).sum(0) - 0.5 * np.linalg.slogdet(matrix)[1])
+    return np.logaddexp.reduce(logs, 0) - np.log(len(logs))
+
+
 def _log_evidence(found: Seen, score: Array, name: str, nonnegative: bool) -> Array:
     """Return the logarithm of the likelihood of an effect of unknown size against none, for scores (D, P), as (D)."""
     own = [k for k, other in enumerate(found.names) if other == name]
@@ -246,6 +302,8 @@ def observed(truth: dict[str, Any], capture: Path, model: Path) -> dict[str, Any
             c.effect.name for c in library_of(()) if [p.nonnegative for p in c.effect.parameters] == [True]
         )
         row["best"] = best_recall(found, truth["effects"][0], one_sided)
+    if len(truth["effects"]) == 2 and None not in row["limits"].values():
+        row["best"] = best_pair_recall(found, truth["effects"])
     return {**row, "errors": true_errors(truth, capture, model)}
 
 
@@ -269,39 +327,86 @@ def is_nameable(found: Sequence[float] | None) -> bool | None:
     return None if found is None else found[0] > NAMEABLE[0] and found[1] > NAMEABLE[1]
 
 
+PARTS = ("that move a body by 17 slow errors or more", "that move it by less", "pairs")
+"""Parts of the captures of which the observer is asked."""
+
+
+def parts_of(rows: Sequence[dict[str, Any]], truths: dict[str, Any]) -> list[list[dict[str, Any]]]:
+    """Return the rows of each of `PARTS` whose effects are all such as the observer is asked of."""
+    asked = [row for row in rows if None not in row["limits"].values()]
+    single = [row for row in asked if len(row["limits"]) == 1]
+    small = [row for row in single if (ratio_of(truths[row["case"]]) or 0.0) < BINS[0][1]]
+    return [[row for row in single if row not in small], small, [row for row in asked if len(row["limits"]) == 2]]
+
+
 def table(rows: Sequence[dict[str, Any]], truths: dict[str, Any], answers: dict[str, Any]) -> str:
     """Return how many effects are nameable, and how many of these were named, by their size and of pairs."""
-    single, lines = [row for row in rows if len(row["limits"]) == 1], []
-    for low, high in BINS:
-        inside = [row for row in single if low <= (ratio_of(truths[row["case"]]) or 0.0) < high]
-        told = [(row, is_nameable(*row["limits"].values())) for row in inside]
-        told = [(row, one) for row, one in told if one is not None]
-        lines.append(f"ratio from {low:g} to {high:g}: nameable {rate([one for _, one in told])}")
-        best = [row["best"] for row, _ in told if "best" in row]
+    lines = []
+    for part, own in zip(PARTS, parts_of(rows, truths), strict=True):
+        told = [all(is_nameable(one) for one in row["limits"].values()) for row in own]
+        lines.append(f"{part}: nameable {rate(told)}")
+        best = [row["best"] for row in own if "best" in row]
         if best:
             error = 1.96 * float(np.std(best)) / np.sqrt(len(best))
-            lines.append(f"ratio from {low:g} to {high:g}: the best observer names {np.mean(best):.0%} +- {error:.0%}")
-        lines += _named(f"ratio from {low:g} to {high:g}", [row for row, one in told if one], truths, answers)
+            lines.append(
+                f"{part}: the best observer names {sum(best):.1f} of {len(best)}, {np.mean(best):.0%} +- {error:.0%}"
+            )
+        lines += _named(part, own, truths, answers)
+        lines += _named(f"{part}, nameable", [row for row, one in zip(own, told, strict=True) if one], truths, answers)
     for key in ("open_loop_m", "flight_m"):
-        pairs = [(row["errors"]["before"][key], row["errors"]["true"][key]) for row in rows if row.get("errors")]
-        ratios = [after / before for before, after in pairs if before and after]
+        ratios = _ratios(rows, key)
         if ratios:
             low, middle, high = np.percentile(ratios, (25, 50, 75))
             lines.append(
                 f"test split, true effects / none, {key}: {middle:.2f} ({low:.2f} to {high:.2f}), n {len(ratios)}"
             )
-    pairs = [row for row in rows if len(row["limits"]) == 2]
-    told = [(row, [is_nameable(one) for one in row["limits"].values()]) for row in pairs]
-    told = [(row, both) for row, both in told if None not in both]
-    lines.append(f"pairs of flight and measurement: both nameable {rate([all(both) for _, both in told])}")
-    return "\n".join([*lines, *_named("pairs", [row for row, both in told if all(both)], truths, answers)])
+    return "\n".join(lines)
+
+
+def _ratios(rows: Sequence[dict[str, Any]], key: str) -> list[float]:
+    """Return errors of the test split with the true effects, over those without."""
+    pairs = [(row["errors"]["before"][key], row["errors"]["true"][key]) for row in rows if row.get("errors")]
+    return [after / before for before, after in pairs if before and after]
+
+
+def record_figures(
+    rows: Sequence[dict[str, Any]], truths: dict[str, Any], answers: dict[str, Any], command: str
+) -> None:
+    """Write what the best observer names, beside what cgwm names of the same captures, to benchmarks/results/."""
+    for part, own in zip(PARTS, parts_of(rows, truths), strict=True):
+        best = [row["best"] for row in own if "best" in row]
+        marks = [judge(truths[row["case"]], answers["cgwm"].get(row["case"]))["mark"] in RIGHT for row in own]
+        if best:
+            what = "pairs of effects, both" if part == "pairs" else f"effects of flight and measurement {part}"
+            reached = f", {100 * sum(marks) / sum(best):.0f} % of it" if sum(best) else ""
+            record(
+                "real_like",
+                figure=f"real-like, {what}: an observer who knows the errors would name",
+                value=f"{sum(best):.1f} of {len(best)} ({100 * np.mean(best):.0f} %)",
+                target="",
+                met=None,
+                note=f"of the same captures cgwm names {sum(marks)}{reached}",
+                command=command,
+            )
+    for key, where in (("open_loop_m", ""), ("flight_m", " before the first contact")):
+        ratios = _ratios(rows, key)
+        if ratios:
+            low, middle, high = np.percentile(ratios, (25, 50, 75))
+            record(
+                "real_like",
+                figure=f"real-like, open-loop error on test episodes{where}, with the true effect at its true numbers "
+                "/ without it",
+                value=round(float(middle), 2),
+                note=f"median of {len(ratios)} captures, named or not; half lie within {low:.2f} to {high:.2f}",
+                command=command,
+            )
 
 
 def _named(what: str, rows: Sequence[dict[str, Any]], truths: dict[str, Any], answers: dict[str, Any]) -> Iterator[str]:
-    """Yield a line that says how many of some nameable captures were named, for each contender."""
+    """Yield a line that says how many of some captures were named, for each contender."""
     for who, own in answers.items():
         marks = [judge(truths[row["case"]], own.get(row["case"]))["mark"] in RIGHT for row in rows]
-        yield f"{what}: of those nameable {who} names {rate(marks)}"
+        yield f"{what}: {who} names {rate(marks)}"
 
 
 def _answers(path: Path) -> dict[str, Any]:
@@ -324,7 +429,10 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no capture after this time")
     parser.add_argument("--out", type=Path, default=None, help="file of the results, JSON lines; known cases are kept")
     parser.add_argument("--answers", type=Path, default=None, help="store of missing_effects.py: recall of what is")
+    parser.add_argument("--record", action="store_true", help="with --answers: write a report's figures to results/")
     given = parser.parse_args(words)
+    if given.record and not given.answers:
+        parser.error("--record wants --answers, of the same captures.")
     captures, deadline = given.captures or ROOT / "out" / "real_like" / given.stage, time.monotonic() + given.seconds
     models = captures.with_name(f"{captures.name}.models")
     paths = sorted(captures.with_name(f"{captures.name}.truth").glob("*.json"))
@@ -349,7 +457,10 @@ def main(words: Sequence[str] | None = None) -> int:
                 with given.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")
     rows = [row for row in rows if row["case"] in truths]
-    print(table(rows, truths, _answers(given.answers) if given.answers else {}))
+    answers = _answers(given.answers) if given.answers else {}
+    print(table(rows, truths, answers))
+    if given.record:
+        record_figures(rows, truths, answers, f"python benchmarks/ideal_observer.py --stage {given.stage}")
     return 0
 
 
