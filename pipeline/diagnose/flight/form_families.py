@@ -7,6 +7,10 @@ A constant force may be that of a place: of a spring towards it, of a vortex abo
 across the room. Such a force is another one at the other end of a flight, and constant in none, but a few short flights
 from one hand pass the same places. It has further numbers beside the constant force, which cost what they do in BIC.
 
+Where a force begins or ends to act is a number of its form, and the likelihood is summed over it: at few places where
+such a form is one of many, at more of them along the coordinate that the law itself follows, of one likelihood together
+before the data. A step is told so sharply by flights that between few places it would be missed.
+
 What a law is least known in is the coordinate that it follows: a drag that is none is likelier to follow the speed in
 another way than to act on one side of the room. Before the data, the families of such coordinates are together as
 likely as all others. Nothing is known that pushes a body in one direction of the world, by how fast it spins.
@@ -46,6 +50,10 @@ OTHER_DRAG = {("linear_drag", 1): "quadratic_drag", ("quadratic_drag", -1): "lin
 """Powers of the speed that make one drag of the library another one."""
 
 
+Factors = dict[str, tuple[Tensor, float]]
+"""Factors of a force (B, T) by a description in words, each with how likely it is before the data."""
+
+
 class Family(NamedTuple):
     """Forms of a force that differ in one coordinate."""
 
@@ -55,6 +63,8 @@ class Family(NamedTuple):
     """Each by a description in words."""
     then: str
     """What to record next to tell them apart."""
+    shares: tuple[float, ...] = ()
+    """How likely each is before the data, in units of one of the others; none where all are alike."""
 
 
 def own_field(motion: FlownMotion, active: ActiveEffect) -> ForceField | None:
@@ -115,24 +125,31 @@ def families_of(motion: FlownMotion, own: ForceField, named: tuple[str, ...], of
     same = "the same torque" if bool(own.turning.any()) else "the same force"
     place = dict(zip(("x", "y", "height"), motion.com_m.unbind(-1), strict=True))
     level = {**_where(motion, "x", place["x"]), **_where(motion, "y", place["y"])}
+    follows = FOLLOWS.get(named[0], ())
+    speed = _how_fast(motion, "speed", motion.velocity_m_s, _known_powers(named), "speed" in follows)
+    spin = {} if _is_constant(own) else _how_fast(motion, "spin", motion.omega_rad_s, set(), "spin" in follows)
     found = {
-        "time": (_when(motion), "record shorter and longer flights"),
-        "height": (_where(motion, "height", place["height"]), "record lower and higher flights"),
-        "place": (level, "record flights elsewhere"),
-        "speed": (_how_fast(motion, "speed", motion.velocity_m_s, named), "record slower and faster flights"),
-        "spin": (
-            {} if _is_constant(own) else _how_fast(motion, "spin", motion.omega_rad_s),
-            "record flights with less and with more spin",
-        ),
+        "time": (_alike(_when(motion)), "record shorter and longer flights"),
+        "height": (_alike(_where(motion, "height", place["height"])), "record lower and higher flights"),
+        "place": (_alike(level), "record flights elsewhere"),
+        "speed": (speed, "record slower and faster flights"),
+        "spin": (spin, "record flights with less and with more spin"),
     }
     families = [
-        Family(coordinate, {f"{same} {words}": own.times(factor) for words, factor in factors.items()}, then)
+        Family(
+            coordinate,
+            {f"{same} {words}": own.times(factor) for words, (factor, _) in factors.items()},
+            then,
+            tuple(share for _, share in factors.values()),
+        )
         for coordinate, (factors, then) in found.items()
     ]
     steady = _constant(motion, own, named) if of_places else []
     if steady:
-        place = next(family for family in families if family.coordinate == "place")
-        place.forms.update(_of_places(motion, steady[0]))
+        place = next(k for k, family in enumerate(families) if family.coordinate == "place")
+        further = _of_places(motion, steady[0])
+        families[place].forms.update(further)
+        families[place] = families[place]._replace(shares=(*families[place].shares, *[1.0] * len(further)))
     return [family for family in (*families, _swinging(motion, own)) if family.forms]
 
 
@@ -209,17 +226,37 @@ def _of_places(motion: FlownMotion, own: ForceField) -> Mapping[str, ForceField]
     }
 
 
-def _how_fast(motion: FlownMotion, name: str, vectors: Tensor, named: tuple[str, ...] = ()) -> Mapping[str, Tensor]:
-    """Return factors of a force by other powers of speed or spin, or on one side of it; none where it has no spread."""
+def _alike(factors: Mapping[str, Tensor]) -> Factors:
+    """Return factors none of which is likelier than another before the data."""
+    return {words: (factor, 1.0) for words, factor in factors.items()}
+
+
+def _how_fast(motion: FlownMotion, name: str, vectors: Tensor, known: set[int], follows: bool) -> Factors:
+    """Return factors of a force by other powers of speed or spin, or on one side of it; none where it has no spread.
+
+    Args:
+        motion: The flights.
+        name: Speed or spin.
+        vectors: Velocities or spins (B, T, 3).
+        known: Powers that make the force another one that is known.
+        follows: Whether the law of the force follows it.
+    """
     plain, size = vectors.norm(dim=-1), _in_medians(motion, name, vectors)
     if not bool((size[motion.inside] - 1).abs().max() > 1e-6):
         return {}
-    known = _known_powers(named)
-    found = {f"times the {name} to the power {power}": size**power for power in LIMITS.powers if power not in known}
-    for edge in torch.quantile(plain[motion.inside], torch.tensor(LIMITS.edges, dtype=plain.dtype)).tolist():
+    found = _alike(
+        {f"times the {name} to the power {power}": size**power for power in LIMITS.powers if power not in known}
+    )
+    edges = LIMITS.own_edges if follows else LIMITS.edges
+    share = len(LIMITS.edges) / len(edges)
+    for edge in torch.quantile(plain[motion.inside], torch.tensor(edges, dtype=plain.dtype)).tolist():
         on = (plain > edge).double()
         words = f"{edge:.2g} {'m/s' if name == 'speed' else 'rad/s'} alone"
-        found |= {f"where the {name} is above {words}": on, f"where the {name} is below {words}": 1 - on}
+        for side, factor in (
+            (f"where the {name} is above {words}", on),
+            (f"where the {name} is below {words}", 1 - on),
+        ):
+            found[side] = (factor, share + found.get(side, (factor, 0.0))[1])
     return found
 
 

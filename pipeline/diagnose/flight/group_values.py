@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...optimization.tails import student_tail
+from ...physics.effects.registry import FLIGHT_ALIASES
 from ...physics.parameters import effect_parameters
 from ...physics.world import World
 from ...segments.candidates import (
@@ -232,7 +233,8 @@ def _fits(search: _Search, place: _Place) -> list[_Fitted]:
     world, flight = place.world, place.flight
     spun = flight.observations.spin_rad_s is not None
     kept, _ = admissible(world, search.candidates, search.prepared.has_orientation, spun)
-    kept = [candidate for candidate in kept if _suits(candidate)]
+    present = {active.effect.name for active in world.effects}
+    kept = [candidate for candidate in kept if _suits(candidate) and not _alike(candidate, present)]
     variants = variants_of(kept, world.gravity[0, :1])
     if not variants:
         return []
@@ -308,6 +310,11 @@ def _suits(candidate: Candidate) -> bool:
     effect = candidate.effect
     few = 0 < len(effect.parameters) <= LIMITS.own_parameters
     return few and not effect.constants and "drag" not in effect.needs and effect.phase != "contact"
+
+
+def _alike(candidate: Candidate, present: set[str]) -> bool:
+    """Return whether flights do not tell an effect from one that has one value for all: groups say the same again."""
+    return any(candidate.effect.name in group and present & set(group) for group in FLIGHT_ALIASES)
 
 
 def _solved(linear: Linearization, columns: list[int], mine: NDArray[np.bool_]) -> tuple[Array, float]:

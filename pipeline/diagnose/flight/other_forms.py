@@ -182,7 +182,7 @@ def _compared(
     own = log_mean(logs[:laws])
     half = {words: log - own for words, log in zip(forms, logs[laws:], strict=True)}
     best = max(half, key=lambda one: half[one])
-    together = [log_mean([half[words] for words in family.forms]) for family in families]
+    together = [log_mean([half[words] for words in family.forms], family.shares) for family in families]
     odds = 2 * (log_mean(together, weights_of(families, name)) + math.log(forces))
     then = next(family.then for family in families if best in family.forms)
     instead = _not_needed(fit, fit.forms[laws + forms.index(best)], dispersion, likeliest.scatter)

@@ -220,9 +220,7 @@ def judged(
         found.flight, found.world, found.classes, scatter, candidates, prepared.has_orientation, prepared.groups
     )
     fleeting = frozenset(without_lasting(found.flight, found.world, found.names, scatter))
-    wrong = {one.effect for one in others if one.likelier} | fleeting
-    # what is known to be another law may also do what a further effect was found for
-    wrong |= {name for one in others if one.odds > LIMITS.other_law for name in one.instead} & set(found.names)
+    wrong = _imitating(others, found.names) | fleeting
     withheld: frozenset[str] = frozenset()
     if wrong and set(found.names) - wrong and not _is_mostly_other(found, others):
         if _most_evident(found) in wrong or any(_carrying(found, name) for name in wrong):
@@ -248,6 +246,15 @@ def judged(
         withheld=withheld,
         levelled=levelled,
     )
+
+
+def _imitating(others: Sequence[OtherForms], names: Sequence[str]) -> set[str]:
+    """Return the effects whose law is another one, and those that flights do not ask for beside such a law.
+
+    A law that fits better than that of an effect may also do what a further effect was found for.
+    """
+    wrong = [one for one in others if one.likelier]
+    return {one.effect for one in wrong} | {name for one in wrong if one.gain > 0 for name in one.instead} & set(names)
 
 
 def _most_evident(found: FlightSelection) -> str:

@@ -127,6 +127,14 @@ def test_beside_a_force_of_another_law_nothing_smaller_is_named(odds: float, bic
     assert flight_selection._is_mostly_other(found, [form]) == mostly
 
 
+@pytest.mark.parametrize(("gain", "odds", "wrong"), [(5.0, 0.0, "ab"), (-1.0, 0.0, "a"), (5.0, -3.0, "")])
+def test_what_another_law_that_fits_better_does_too_is_not_named_beside_it(
+    gain: float, odds: float, wrong: str
+) -> None:
+    form = OtherForms(effect="a", words="", gain=gain, odds=odds, then="", instead=frozenset({"b", "gone"}))
+    assert flight_selection._imitating([form], ["a", "b", "c"]) == set(wrong)
+
+
 @pytest.mark.parametrize(("fall", "least", "stays"), [(-1.2, -1.0, False), (-0.5, -1.0, True), (1.5, 2.0, False)])
 def test_an_effect_of_contact_that_raises_held_out_errors_is_not_named(
     monkeypatch: pytest.MonkeyPatch, fall: float, least: float, stays: bool

@@ -10,13 +10,14 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose.flight import other_forms as forms_module
-from cgwm.pipeline.diagnose.flight.form_families import Family, weights_of
+from cgwm.pipeline.diagnose.flight.form_families import Family, families_of, own_field, weights_of
 from cgwm.pipeline.diagnose.flight.other_forms import OtherForms, _forces, log_mean, other_forms, own_form
 from cgwm.pipeline.diagnose.report import wording
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.effects.effect import BodyMotion, Effect, EffectParameter, Values, Wrench
 from cgwm.pipeline.physics.world import World
 from cgwm.pipeline.segments.candidates import Candidate, base_parameters
+from cgwm.pipeline.segments.flights.force_fields import FlownMotion
 from cgwm.pipeline.segments.prepare import prepare
 from cgwm.pipeline.segments.segment_fit import refit
 from cgwm.pipeline.trajectories.track_noise import Noise
@@ -203,6 +204,20 @@ def test_where_two_drags_are_not_told_apart_other_forms_have_to_beat_both() -> N
     (alone,), (either,) = forms_of(ball, data, ["linear_drag"]), forms_of(ball, data, ["linear_drag"], "quadratic_drag")
     assert alone.likelier and alone.words == "the same force times the speed to the power 1"
     assert not either.likelier
+
+
+def test_steps_along_what_a_law_follows_are_many_and_together_as_likely_as_few() -> None:
+    ball = world_with("ball", {"linear_drag": {"c": 0.3}})
+    prepared = prepare(ball, tosses(ball, 1, 1, 0.3, 60.0, NOISE, (0.9, 1.2)), NOISE)
+    assert prepared.flight is not None
+    motion = FlownMotion(refit([prepared.flight], ball, []).segments[0])
+    own = own_field(motion, ball.effects[0])
+    assert own is not None
+    families = {family.coordinate: family for family in families_of(motion, own, ("linear_drag",))}
+    speed = families["speed"]
+    steps = [share for words, share in zip(speed.forms, speed.shares, strict=True) if "alone" in words]
+    assert 10 < len(steps) <= 18 and sum(steps) == pytest.approx(8.0)
+    assert set(families["height"].shares) == {1.0}
 
 
 def test_forms_that_differ_in_what_a_law_follows_are_as_likely_as_all_others() -> None:

@@ -15,7 +15,7 @@ from cgwm.pipeline.diagnose.flight import findings as flight_findings
 from cgwm.pipeline.diagnose.flight import own_tilt
 from cgwm.pipeline.diagnose.flight import selection as flight_selection
 from cgwm.pipeline.diagnose.flight.findings import _Search
-from cgwm.pipeline.diagnose.flight.group_values import in_several
+from cgwm.pipeline.diagnose.flight.group_values import _alike, in_several
 from cgwm.pipeline.diagnose.flight.own_accelerations import OwnAccelerations  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.flight.rest_tilts import rests_confirm  # pyright: ignore[reportMissingImports]
 from cgwm.pipeline.diagnose.flight.selection import FlightSelection
@@ -315,6 +315,19 @@ def test_an_effect_that_each_group_has_of_its_own_is_named_for_groups(drags: tup
 def test_a_drag_that_one_group_alone_has_is_none(name: str, values: tuple[list[float], ...], several: bool) -> None:
     by_group = {k: np.array(value) for k, value in enumerate(values)}
     assert in_several(Candidate(name, load_effect(name)), by_group) == several
+
+
+@pytest.mark.parametrize(
+    ("name", "present", "again"),
+    [
+        ("clock_scale", {"length_scale"}, True),
+        ("frame_tilt", {"constant_force"}, True),
+        ("clock_scale", {"linear_drag", "gravity_tilt"}, False),
+        ("linear_drag", {"linear_drag", "length_scale"}, False),
+    ],
+)
+def test_groups_have_no_value_beside_one_for_all_that_does_the_same(name: str, present: set[str], again: bool) -> None:
+    assert _alike(Candidate(name, load_effect(name)), present) == again
 
 
 @pytest.mark.evidence
