@@ -28,7 +28,8 @@ ENVELOPE_ITERATIONS = 20
 """Iterations of the lower envelope of all places: an expectile (Newey & Powell 1987)."""
 _BELONG_TOGETHER = (
     "a shape, a ground and tracks that belong together.",
-    "check [[bodies]] shape, [world] ground, whether the tracks' frame is level, and which body was tracked.",
+    "check [[bodies]] shape, [world] ground, whether the tracks' frame is level, that quaternions have w first and "
+    "turn the body into the world, and which body was tracked.",
 )
 """What would be usable and what to do, where tracks and geometry do not agree."""
 
@@ -64,7 +65,8 @@ def _check_mass(body: Body, where: str) -> None:
             f"{where}: '{body.name}' has moments of inertia of {least:.3g} to {greatest:.3g} kg m2; with all its "
             f"{mass:.3g} kg on its surface it would have {mass * reach**2:.3g} kg m2 at most.",
             "inertia_kg_m2 of that mass and shape.",
-            "check [[bodies]] inertia_kg_m2, mass_kg and shape, or leave the inertia out.",
+            "check [[bodies]] inertia_kg_m2, mass_kg and shape, or leave the inertia out. If it was fitted, the turns "
+            "are not those of such a body: check that quaternions have w first and turn the body into the world.",
         )
 
 
