@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+
+import torch
 
 from ...physics.world import World
 from ...segments.flights.residual_wrench import Omnibus, ResidualWrenches, omnibus, residual_wrenches, sound_windows
@@ -21,8 +24,20 @@ def flight_windows(prepared: Prepared, world: World) -> list[tuple[Segments, Res
 
 def worst_omnibus(windows: Sequence[tuple[Segments, ResidualWrenches]], scatter: float) -> Omnibus | None:
     """Return the omnibus statistic with the smallest p-value over all window lengths; None without flight."""
-    found = [omnibus(wrenches, scatter) for _, wrenches in windows]
+    found = [omnibus(wrenches, scatter, _noise_dof(segments)) for segments, wrenches in windows]
     return min(found, key=lambda one: (one.p_value, -one.statistic), default=None)
+
+
+def _noise_dof(segments: Segments) -> float:
+    """Return the degrees of freedom from which the size of correlated noise is known; inf where none is correlated.
+
+    A process whose correlation falls to 1/e within a time has about one independent sample of its variance in this
+    time: flights of some seconds know errors that last for tenths of a second to some tens of percent.
+    """
+    seen, times = segments.observations.seen.amax(-1) > 0, segments.observations.times_s
+    span_s = times.masked_fill(~seen, -torch.inf).amax(1) - times.masked_fill(~seen, torch.inf).amin(1)
+    total_s = float(span_s.clamp_min(0.0).nan_to_num(0.0, 0.0, 0.0).sum())
+    return min((3 * total_s / one.time_s for one in segments.noise_model if one.share), default=math.inf)
 
 
 def is_significant(found: Omnibus | None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...geometry.rotation import quat_rotate
-from ...optimization.tails import chi2_tail
+from ...optimization.tails import chi2_tail, f_tail
 from ...physics.body import Body
 from ...physics.effects.effect import ActiveEffect, BodyMotion, Effect
 from ...physics.effects.linear_drag import LinearDrag
@@ -97,7 +98,7 @@ class ResidualWrenches:
 class Omnibus:
     """The test whether anything is missing in flight.
 
-    The p-value assumes noise that is normal, independent from frame to frame and of the stated size.
+    The p-value assumes normal noise; where it is correlated, its size is known from the flights alone (Fisher's F).
     """
 
     statistic: float
@@ -190,17 +191,20 @@ def wrench_windows(
     return residual_wrenches(fit_states(Segments.of("flight", world, whole, windows, noise, memory)))
 
 
-def omnibus(found: ResidualWrenches, scatter: float = 1.0) -> Omnibus:
+def omnibus(found: ResidualWrenches, scatter: float = 1.0, noise_dof: float = math.inf) -> Omnibus:
     """Return the test that all residual wrenches vanish, for windows that do not overlap.
 
     Args:
         found: The residual wrenches.
         scatter: Factor of the noise variance, see `dispersion`.
+        noise_dof: Degrees of freedom from which the size of the noise is known.
     """
     score = np.einsum("nij,nj->ni", found.information, found.wrench)
     chi2 = float(np.einsum("ni,ni->", score, found.wrench)) / scatter
     dof = float(np.einsum("nij,nji->", found.information, found.covariance))
-    return Omnibus(chi2 / max(dof, 1e-9), dof, chi2_tail(chi2, max(dof, 1e-9)))
+    dof = max(dof, 1e-9)
+    known = math.isinf(noise_dof)
+    return Omnibus(chi2 / dof, dof, chi2_tail(chi2, dof) if known else f_tail(chi2 / dof, dof, max(noise_dof, 1.0)))
 
 
 def sound_windows(segments: Segments, found: ResidualWrenches) -> tuple[Segments, ResidualWrenches]:

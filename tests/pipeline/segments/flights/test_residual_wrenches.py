@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from cgwm.pipeline.diagnose.flight.omnibus import _noise_dof
 from cgwm.pipeline.optimization.tails import chi2_tail
 from cgwm.pipeline.segments import contact_phases as contact_phases_module
 from cgwm.pipeline.segments.carried_starts import LIMITS as CARRIED
@@ -38,10 +39,12 @@ from cgwm.pipeline.segments.flights.slow_errors import _level_axes
 from cgwm.pipeline.segments.input_checks import LIMITS as INPUT
 from cgwm.pipeline.segments.input_checks import _apart, _on_a_tilted_plane, _travel, _turns
 from cgwm.pipeline.segments.thresholds import SEGMENT_THRESHOLDS
+from cgwm.pipeline.trajectories.innovations import CorrelatedNoise, NoiseModel
 from cgwm.pipeline.trajectories.segmentation import Segment, size_of
 from cgwm.pipeline.trajectories.track_noise import Noise
 from helpers.worlds import F64, ball_body, box_body, world_of
 from scipy.spatial.transform import Rotation
+from scipy.stats import f as fisher
 
 
 def wrenches(wrench: np.ndarray, episode: np.ndarray, seed: int = 0) -> ResidualWrenches:
@@ -66,6 +69,10 @@ def test_the_omnibus_test_is_chi_square_of_the_wrenches() -> None:
     one, wider = omnibus(found), omnibus(found, 2.0)
     assert one.dof == pytest.approx(dof) and one.statistic == pytest.approx(chi2 / dof)
     assert wider.statistic == pytest.approx(chi2 / dof / 2) and wider.p_value == pytest.approx(chi2_tail(chi2 / 2, dof))
+    # the size of correlated noise is known from as many samples as it has
+    rough = omnibus(found, 2.0, 40.0)
+    assert rough.statistic == wider.statistic and rough.p_value == pytest.approx(fisher.sf(chi2 / dof / 2, dof, 40.0))
+    assert omnibus(found, 2.0, 1e7).p_value == pytest.approx(wider.p_value, rel=1e-3)
     rows = torch.full((20, 5, 6), 3.0, dtype=F64)
     segments: Any = SimpleNamespace(
         residuals=lambda *_, jacobian: (rows, jacobian),
@@ -75,6 +82,17 @@ def test_the_omnibus_test_is_chi_square_of_the_wrenches() -> None:
     assert dispersion(segments, found) == pytest.approx((20 * 30 * 9 - chi2) / (20 * 25 - dof))
     rows *= 0.1
     assert dispersion(segments, found) == 1.0
+
+
+def test_correlated_noise_is_known_from_as_many_samples_as_flights_last() -> None:
+    seen = torch.ones(2, 5, 1, dtype=F64)
+    seen[1, 4:] = 0.0
+    times = 0.1 * torch.arange(5, dtype=F64).expand(2, 5)
+    noise = NoiseModel(CorrelatedNoise(share=0.9, time_s=0.07), CorrelatedNoise())
+    segments: Any = SimpleNamespace(observations=SimpleNamespace(seen=seen, times_s=times), noise_model=noise)
+    assert _noise_dof(segments) == pytest.approx(3 * (0.4 + 0.3) / 0.07)
+    segments.noise_model = NoiseModel()
+    assert _noise_dof(segments) == np.inf
 
 
 def test_covariates_explain_what_their_bins_share() -> None:
