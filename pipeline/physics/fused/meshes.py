@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,6 +14,8 @@ from torch import Tensor
 from ..surfaces.fixed_surface import FixedSurface
 from ..surfaces.surface_mesh import SurfaceMesh
 
+STEP_M = 0.004
+"""How far a sphere moves in most steps [m]."""
 _KEPT = 8
 """Number of sets of meshes whose arrays are kept: rollouts of one world follow each other."""
 
@@ -29,18 +32,25 @@ class PackedMeshes:
     """First number and first index of each surface's mesh."""
 
 
-def packed_meshes(surfaces: Sequence[FixedSurface]) -> PackedMeshes:
-    """Return the meshes of surfaces; those that are no meshes take no room."""
-    return _packed(tuple(surface.mesh for surface in surfaces))
+def packed_meshes(surfaces: Sequence[FixedSurface], radius_m: float) -> PackedMeshes:
+    """Return the meshes of surfaces, for spheres of a radius [m] at most; those that are no meshes take no room."""
+    return _packed(tuple(surface.mesh for surface in surfaces), radius_m)
+
+
+def _reach(radius_m: float) -> float:
+    """Return how far triangles are told from the centres of spheres [m]: one reach for radii that differ little."""
+    wanted = max(radius_m + max(0.5 * radius_m, STEP_M), STEP_M)
+    return 1.2 ** math.ceil(math.log(wanted, 1.2))
 
 
 @lru_cache(_KEPT)
-def _packed(meshes: tuple[SurfaceMesh | None, ...]) -> PackedMeshes:
+def _packed(meshes: tuple[SurfaceMesh | None, ...], radius_m: float) -> PackedMeshes:
     numbers, indices, starts = [np.zeros(0)], [np.zeros(0, np.int64)], []
     for mesh in meshes:
         starts.append((sum(map(len, numbers)), sum(map(len, indices))))
         if mesh is not None:
-            numbers.append(mesh.numbers())
-            indices.append(mesh.indices())
+            near = mesh.neighbourhood(_reach(max(radius_m, mesh.cell_m) if mesh.solid else radius_m))
+            numbers.append(mesh.numbers(near))
+            indices.append(mesh.indices(near))
     flat = torch.from_numpy(np.concatenate(indices).astype(np.int32))
     return PackedMeshes(torch.from_numpy(np.concatenate(numbers)), flat, tuple(starts))

@@ -192,7 +192,7 @@ def _fixed(world: World) -> _Fixed:
     hulls = [row for body in world.bodies for row in body.once(_hull_rows)]
     surfaces = [_surface(surface, turn) for surface in world.surfaces]
     listed, lowest = _listed_spheres(world)
-    effects, meshes = wrenches.coefficients(world), packed_meshes(world.surfaces)
+    effects, meshes = wrenches.coefficients(world), packed_meshes(world.surfaces, _largest_sphere(world))
     published = isinstance(world.contact, PaperLaw)  # the directions of its rows are chosen in the world's frame
     turned = turn is not None and (published or len(world.bodies) > 1 or bool(world.surfaces))
     return _Fixed(
@@ -204,6 +204,11 @@ def _fixed(world: World) -> _Fixed:
         meshes=meshes,
         structure=_structure(world, effects=bool(effects), turned=turned, lowest=lowest, mesh_starts=meshes.starts),
     )
+
+
+def _largest_sphere(world: World) -> float:
+    """Return the largest radius of a colliding sphere [m]; 0 without any."""
+    return max((float(body.radii.max()) for body in world.bodies if body.radii.shape[-1]), default=0.0)
 
 
 def _structure(

@@ -8,6 +8,10 @@ for every way w along the mesh. On an edge, with the way w' into the other trian
 is |d| <= b max(0, -n . w') / c. At a corner, for ways whose parts in the plane are at most an angle g apart, one of
 these is within g / 2 of d, so that |d| <= b max(-n . w / |w in the plane|) / cos(g / 2). The overhang of a triangle is
 the largest of these bounds over b. No foot is farther beyond any edge than it is from the nearest place.
+
+At borders, and at edges as sharp as that of a groove of less than 90 degrees, nothing bounds d: such an edge is open. A
+foot that is not beyond an open edge has d . e <= 0 at its corners, e the outward normal of the edge in the plane: there
+e counts as one more way.
 """
 
 from __future__ import annotations
@@ -24,28 +28,41 @@ STEEPEST = 0.2
 """Ways whose part along a triangle's plane is smaller tell nothing."""
 MOST_WAYS = 24
 """Number of edges of a corner above which nothing is told."""
+STEEP = 0.5
+"""Overhang of an edge above which it counts as open."""
 NONE = 1e30
 """Overhang where nothing is told: above 20 it is of no use."""
 
 
 def overhangs(
-    corners: Array, normals: Array, ways: tuple[Indices, Indices, Array], counting: NDArray[np.bool_]
+    corners: Array, normals: Array, outward: Array, ways: tuple[Indices, Indices, Array], counting: NDArray[np.bool_]
 ) -> Array:
-    """Return the overhangs of triangles above and below, shape (F, 2).
+    """Return the overhangs of triangles above and below, and their open edges there as bits of a number, shape (F, 4).
 
     Args:
         corners: Corners of the triangles (F, 3, 3).
         normals: Their unit normals (F, 3).
+        outward: Outward unit normals (F, 3, 3) of their edges within their planes.
         ways: First way of each feature (F, 7), number of its ways (F, 7), and all ways (W, 3).
         counting: Which features count for which triangle, shape (F, 7).
     """
     start, count, every = ways
-    found = np.zeros((len(corners), 2))
+    found = np.zeros((len(corners), 4))
     for side, up in enumerate((normals, -normals)):
         at_edges = _at_edges(up, start[:, 1:4], count[:, 1:4], every)
-        bounds = np.concatenate((at_edges, _at_corners(corners, up, start[:, 4:], count[:, 4:], every)), 1)
-        found[:, side] = np.where(counting[:, 1:], bounds, 0.0).max(1)
-    return np.where(found < 20.0, found, NONE)
+        open_ = at_edges > STEEP
+        at_corners = _at_corners(corners, up, outward, open_, (start[:, 4:], count[:, 4:], every))
+        bounds = np.concatenate((np.where(open_, 0.0, at_edges), at_corners), 1)
+        largest = np.where(counting[:, 1:], bounds, 0.0).max(1)
+        found[:, side] = np.where(largest < 20.0, largest, NONE)
+        found[:, 2 + side] = open_ @ np.array([1, 2, 4])
+    return found
+
+
+def open_edges(normals: Array, start: Indices, count: Indices, ways: Array) -> NDArray[np.bool_]:
+    """Return which edges (F, 3) are open above or below; arguments as of `overhangs`."""
+    sides = (_at_edges(up, start[:, 1:4], count[:, 1:4], ways) for up in (normals, -normals))
+    return np.maximum(*sides) > STEEP
 
 
 def _at_edges(up: Array, start: Indices, count: Indices, ways: Array) -> Array:
@@ -57,11 +74,17 @@ def _at_edges(up: Array, start: Indices, count: Indices, ways: Array) -> Array:
     return np.where(told, (np.maximum(-rise, 0.0) + SLACK) / np.maximum(across, STEEPEST), NONE)
 
 
-def _at_corners(corners: Array, up: Array, start: Indices, count: Indices, ways: Array) -> Array:
+def _at_corners(
+    corners: Array, up: Array, outward: Array, open_: NDArray[np.bool_], ways: tuple[Indices, Indices, Array]
+) -> Array:
     """Return the bounds (F, 3) at the corners of triangles whose normals are `up`."""
+    start, count, every = ways
     number = np.arange(min(int(count.max()), MOST_WAYS))
     there = number < count[..., None]
-    way = ways[np.minimum(start[..., None] + number, len(ways) - 1)]  # (F, 3, K, 3)
+    way = every[np.minimum(start[..., None] + number, len(every) - 1)]  # (F, 3, K, 3)
+    # edge k begins at corner k
+    way = np.concatenate((way, outward[:, :, None], np.roll(outward, 1, 1)[:, :, None]), 2)
+    there = np.concatenate((there, open_[..., None], np.roll(open_, 1, 1)[..., None]), 2)
     rise = np.einsum("fcka,fa->fck", way, up)
     first = np.roll(corners, -1, 1) - corners
     first /= np.linalg.norm(first, axis=2, keepdims=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....datasets.shapes.surfaces import require_areas
-from .mesh_overhangs import overhangs
+from .mesh_overhangs import open_edges, overhangs
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -34,8 +34,8 @@ class Topology:
     way_count: Indices
     """Number of its ways; -1 where another triangle has the feature; shape (F, 7)."""
     prisms: Array
-    """Of each triangle its unit normal, the outward unit normals of its sides within its plane, and its overhangs above
-    and below, shape (F, 14)."""
+    """Of each triangle its unit normal, the outward unit normals of its edges within its plane, its overhangs above and
+    below, and its open edges there, as bits of a number, shape (F, 16)."""
 
     @staticmethod
     def of(vertices: Array, faces: Indices, *, solid: bool, name: str) -> Topology:
@@ -58,7 +58,9 @@ class Topology:
         pseudonormals = _pseudonormals(corners, faces, edges, len(vertices))
         ways = ways if len(ways) else np.zeros((1, 3))
         # whether a point is inside a solid is asked of all triangles at the nearest place
-        beside = overhangs(corners, pseudonormals[:, 0], (start, count, ways), owned | solid)
+        outward = -edges.inward.reshape(-1, 3, 3)
+        owned[:, 4:] = _holds(faces, open_edges(pseudonormals[:, 0], start, count, ways))
+        beside = overhangs(corners, pseudonormals[:, 0], outward, (start, count, ways), owned | solid)
         return Topology(
             corners=corners,
             solid=solid,
@@ -66,7 +68,7 @@ class Topology:
             ways=ways,
             way_start=start,
             way_count=np.where(owned, count, -1),
-            prisms=np.concatenate((pseudonormals[:, 0], -edges.inward.reshape(-1, 9), beside), 1),
+            prisms=np.concatenate((pseudonormals[:, 0], outward.reshape(-1, 9), beside), 1),
         )
 
 
@@ -102,7 +104,10 @@ def _joined(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
 
 
 def _ways(vertices: Array, faces: Indices, edges: _Edges) -> tuple[Indices, Indices, NDArray[np.bool_], Array]:
-    """Return first way and number of ways of each feature (F, 7), whether it is the triangle's, and the ways (W, 3)."""
+    """Return first way and number of ways of each feature (F, 7), whether it is the triangle's, and the ways (W, 3).
+
+    Whose the corners are is told by `_holds`.
+    """
     start, count = np.zeros((len(faces), 7), np.int64), np.zeros((len(faces), 7), np.int64)
     owned = np.ones((len(faces), 7), np.bool_)
     # of an edge: into each adjacent triangle; its owner is the first of them
@@ -123,13 +128,23 @@ def _ways(vertices: Array, faces: Indices, edges: _Edges) -> tuple[Indices, Indi
     degree = np.bincount(origin, minlength=len(vertices))
     corner = np.cumsum(degree) - degree + len(ways)
     flat = faces.reshape(-1)
-    seen, holder = np.unique(flat, return_index=True)
-    owners = np.zeros(len(vertices), np.int64)
-    owners[seen] = holder
     start[:, 4:] = corner[flat].reshape(-1, 3)
-    owned[:, 4:] = (owners[flat] == np.arange(len(flat))).reshape(-1, 3)
     count[:, 4:] = degree[flat].reshape(-1, 3)
     return start, count, owned, np.concatenate((ways, direction[order]))
+
+
+def _holds(faces: Indices, open_: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return whether each corner (F, 3) is the triangle's: that of the first one there, with an open edge if any has.
+
+    Args:
+        faces: Indices of the triangles' corners (F, 3).
+        open_: Whether the edges from each corner to the next one are open (F, 3).
+    """
+    flat, first = faces.reshape(-1), (open_ | np.roll(open_, 1, 1)).reshape(-1)
+    order = np.lexsort((~first, flat))
+    held = np.zeros(len(flat), np.bool_)
+    held[order[np.unique(flat[order], return_index=True)[1]]] = True
+    return held.reshape(-1, 3)
 
 
 def _pseudonormals(corners: Array, faces: Indices, edges: _Edges, vertices: int) -> Array:

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .mesh_neighbourhood import Neighbourhood
 from .mesh_topology import Topology
 
 FEATURES = 7
@@ -93,20 +94,29 @@ class SurfaceMesh:
         starts = np.concatenate(([0], np.cumsum(np.bincount(flat, minlength=int(count.prod())))))
         return count, starts, triangle[order]
 
-    def numbers(self) -> Array:
-        """Return the numbers that the kernel reads: box, cell, then corners, pseudonormals, prisms and ways."""
+    def neighbourhood(self, reach_m: float) -> Neighbourhood:
+        """Return the triangles that spheres may touch within a reach [m], by the places of their centres."""
+        if reach_m not in self._neighbourhoods:
+            self._neighbourhoods[reach_m] = Neighbourhood.of(self.topology, reach_m)
+        return self._neighbourhoods[reach_m]
+
+    @cached_property
+    def _neighbourhoods(self) -> dict[float, Neighbourhood]:
+        return {}
+
+    def numbers(self, near: Neighbourhood) -> Array:
+        """Return the numbers that the kernel reads: box, cell, grid, corners, pseudonormals, prisms and ways."""
         t = self.topology
-        head = np.concatenate((self.bounds.ravel(), [self.cell_m]))
+        head = np.concatenate((self.bounds.ravel(), [self.cell_m], near.numbers()))
         return np.concatenate((head, t.corners.ravel(), t.pseudonormals.ravel(), t.prisms.ravel(), t.ways.ravel()))
 
-    def indices(self) -> NDArray[np.int64]:
-        """Return the integers that the kernel reads: sizes, starts and counts of ways, first cells, and the grid."""
+    def indices(self, near: Neighbourhood) -> NDArray[np.int64]:
+        """Return the integers that the kernel reads: sizes, starts and counts of ways, first cells, and the grids."""
         t = self.topology
         count, starts, triangles = self.grid
-        head = [*count, len(t.corners), int(t.solid), len(starts)]
-        return np.concatenate(
-            (head, t.way_start.ravel(), t.way_count.ravel(), self._first_cells.ravel(), starts, triangles)
-        )
+        head = [*count, len(t.corners), int(t.solid), len(starts), *near.cells, len(triangles), len(near.starts)]
+        ways = np.concatenate((t.way_start.ravel(), t.way_count.ravel()))
+        return np.concatenate((head, ways, self._first_cells.ravel(), starts, triangles, near.starts, near.triangles))
 
     @torch.no_grad()
     def features(self, centers: Tensor, radii: Tensor, margin: Tensor) -> tuple[Tensor, Tensor]:

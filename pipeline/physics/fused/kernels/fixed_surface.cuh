@@ -86,11 +86,11 @@ INLINE Point off_side(Point arm, Point side) { return arm - scaled(dot(arm, side
 
 // A triangle mesh as `SurfaceMesh.numbers` and `SurfaceMesh.indices` of `physics/surfaces/surface_mesh.py` write it.
 struct TriangleMesh {
-    Point low, high;
-    Number cell;
-    int cells[3], solid;
+    Point low, high, near_low;
+    Number cell, near_cell, near_reach;
+    int cells[3], near_cells[3], solid;
     const Number *corners, *pseudonormals, *prisms, *ways;
-    const int *way_start, *way_count, *first_cells, *starts, *triangles;
+    const int *way_start, *way_count, *first_cells, *starts, *triangles, *near_starts, *near_triangles;
 };
 
 INLINE TriangleMesh triangle_mesh(const Problem& problem, int s) {
@@ -100,18 +100,26 @@ INLINE TriangleMesh triangle_mesh(const Problem& problem, int s) {
     m.low = point(numbers);
     m.high = point(numbers + 3);
     m.cell = numbers[6];
-    for (int k = 0; k < 3; k++) m.cells[k] = indices[k];
+    m.near_low = point(numbers + 7);
+    m.near_cell = numbers[10];
+    m.near_reach = numbers[11];
+    for (int k = 0; k < 3; k++) {
+        m.cells[k] = indices[k];
+        m.near_cells[k] = indices[6 + k];
+    }
     int count = indices[3];
     m.solid = indices[4];
-    m.corners = numbers + 7;
+    m.corners = numbers + 12;
     m.pseudonormals = m.corners + 9LL * count;
     m.prisms = m.pseudonormals + 21LL * count;
-    m.ways = m.prisms + 14LL * count;
-    m.way_start = indices + 6;
+    m.ways = m.prisms + 16LL * count;
+    m.way_start = indices + 11;
     m.way_count = m.way_start + 7LL * count;
     m.first_cells = m.way_count + 7LL * count;
     m.starts = m.first_cells + 3LL * count;
     m.triangles = m.starts + indices[5];
+    m.near_starts = m.triangles + indices[9];
+    m.near_triangles = m.near_starts + indices[10];
     return m;
 }
 
@@ -157,13 +165,19 @@ INLINE bool is_minimal(const TriangleMesh& m, int feature, Point offset, Number 
 // Whether the distance from a point to the mesh has no minimum within reach at a triangle, since the point is beside it:
 // see `mesh_overhangs.py`.
 INLINE bool is_beside(const TriangleMesh& m, int triangle, Point p, Number reach) {
-    const Number *corners = m.corners + 9LL * triangle, *prism = m.prisms + 14LL * triangle;
+    const Number *corners = m.corners + 9LL * triangle, *prism = m.prisms + 16LL * triangle;
     Point a = p - point(corners);
     Number height = dot(a, point(prism)), high = height < Number(0) ? -height : height;
     if (!(high < reach)) return true;
-    Number most = prism[height < Number(0) ? 13 : 12] * high + Number(1e-5) * reach;
-    return dot(a, point(prism + 3)) > most || dot(a, point(prism + 9)) > most ||
-           dot(p - point(corners + 3), point(prism + 6)) > most;
+    int below = height < Number(0), open = (int)prism[14 + below];
+    Number slack = Number(1e-5) * reach, most = prism[12 + below] * high + slack;
+    Number out[3] = {dot(a, point(prism + 3)), dot(p - point(corners + 3), point(prism + 6)), dot(a, point(prism + 9))};
+    bool beyond = false;
+    for (int k = 0; k < 3; k++) {
+        if (!(open >> k & 1)) beyond = beyond || out[k] > most;
+        else if (!(out[k] < -slack)) return false;
+    }
+    return beyond;
 }
 
 INLINE int cell_of(Number at, Number low, Number cell, int count) {
@@ -179,19 +193,64 @@ INLINE Point beyond_box(const TriangleMesh& m, Point p) {
     return out;
 }
 
-// Finds the contacts of a sphere with a mesh; see `SurfaceMesh.features`.
-__device__ void find(const TriangleMesh& m, Point p, Number radius, Number margin, Searched& found) {
-    Number reach = (m.solid ? greater(radius, m.cell) : radius) + margin;
-    found.count = 0;
-    found.inside = false;
-    Point outside = beyond_box(m, p);
-    if (!(dot(outside, outside) < reach * reach)) return;
+// The contacts of a sphere with a mesh that are found first, by distance, and the nearest place.
+struct Nearest {
+    Number distances[MESH_CONTACTS], keys[MESH_CONTACTS], distance, along;
+    int feature;
+};
+
+// Adds what a sphere about p touches of a triangle.
+INLINE void look_at(const TriangleMesh& m, int triangle, Point p, Number reach, Searched& found, Nearest& nearest) {
+    if (is_beside(m, triangle, p, reach)) return;
+    Point offset;
+    int feature = FEATURES * triangle + closest(m.corners + 9LL * triangle, p, offset);
+    Number far = root(dot(offset, offset));
+    if (!(far < reach)) return;
+    if (m.solid) {
+        Number along = dot(offset, point(m.pseudonormals + 3LL * feature));
+        bool equal = far == nearest.distance, behind = along < Number(0), was = nearest.along < Number(0);
+        bool first = behind == was ? feature < nearest.feature : behind;
+        if (far < nearest.distance || (equal && first)) {
+            nearest.distance = far;
+            nearest.along = along;
+            nearest.feature = feature;
+        }
+        if (behind) return;  // the far side of a wall
+    }
+    if (!is_minimal(m, feature, offset, far)) return;
+    int place = found.count;
+    while (place > 0 && (far < nearest.distances[place - 1] ||
+                         (far == nearest.distances[place - 1] && feature < found.features[place - 1]))) place--;
+    if (place == MESH_CONTACTS) return;
+    if (found.count < MESH_CONTACTS) found.count++;
+    for (int q = found.count - 1; q > place; q--) {
+        nearest.distances[q] = nearest.distances[q - 1];
+        nearest.keys[q] = nearest.keys[q - 1];
+        found.features[q] = found.features[q - 1];
+    }
+    nearest.distances[place] = far;
+    Point order = {Number(ORDER_X), Number(ORDER_Y), Number(ORDER_Z)};
+    nearest.keys[place] = dot(offset, order) / greater(far, Number(1e-15));
+    found.features[place] = feature;
+}
+
+// Looks at the triangles that a sphere about p may touch within the reach of the grid of centres.
+INLINE void look_nearby(const TriangleMesh& m, Point p, Number reach, Searched& found, Nearest& nearest) {
+    Point from = scaled(Number(1) / m.near_cell, p - m.near_low);
+    if (from.x < Number(0) || from.y < Number(0) || from.z < Number(0)) return;
+    if (!(from.x < Number(m.near_cells[0]) && from.y < Number(m.near_cells[1]) && from.z < Number(m.near_cells[2]))) return;
+    int cell = ((int)from.x * m.near_cells[1] + (int)from.y) * m.near_cells[2] + (int)from.z;
+    for (int entry = m.near_starts[cell]; entry < m.near_starts[cell + 1]; entry++) {
+        look_at(m, m.near_triangles[entry], p, reach, found, nearest);
+    }
+}
+
+// Looks at all triangles within reach.
+INLINE void look_around(const TriangleMesh& m, Point p, Number reach, Searched& found, Nearest& nearest) {
     int from[3] = {cell_of(p.x - reach, m.low.x, m.cell, m.cells[0]), cell_of(p.y - reach, m.low.y, m.cell, m.cells[1]),
                    cell_of(p.z - reach, m.low.z, m.cell, m.cells[2])};
     int to[3] = {cell_of(p.x + reach, m.low.x, m.cell, m.cells[0]), cell_of(p.y + reach, m.low.y, m.cell, m.cells[1]),
                  cell_of(p.z + reach, m.low.z, m.cell, m.cells[2])};
-    Number distances[MESH_CONTACTS], keys[MESH_CONTACTS], nearest = Number(1e30), along_nearest = Number(0);
-    int nearest_feature = 0;
     for (int i = from[0]; i <= to[0]; i++)
     for (int j = from[1]; j <= to[1]; j++)
     for (int k = from[2]; k <= to[2]; k++) {
@@ -201,53 +260,37 @@ __device__ void find(const TriangleMesh& m, Point p, Number radius, Number margi
             // a triangle in several cells counts in the first one of those that are looked at
             const int* first = m.first_cells + 3LL * triangle;
             if ((i > from[0] && first[0] < i) || (j > from[1] && first[1] < j) || (k > from[2] && first[2] < k)) continue;
-            if (is_beside(m, triangle, p, reach)) continue;
-            const Number* c = m.corners + 9LL * triangle;
-            Point offset;
-            int feature = FEATURES * triangle + closest(c, p, offset);
-            Number far = root(dot(offset, offset));
-            if (!(far < reach)) continue;
-            if (m.solid) {
-                Number along = dot(offset, point(m.pseudonormals + 3LL * feature));
-                bool equal = far == nearest, behind = along < Number(0), was = along_nearest < Number(0);
-                bool first = behind == was ? feature < nearest_feature : behind;
-                if (far < nearest || (equal && first)) {
-                    nearest = far;
-                    along_nearest = along;
-                    nearest_feature = feature;
-                }
-                if (behind) continue;  // the far side of a wall
-            }
-            if (!is_minimal(m, feature, offset, far)) continue;
-            int place = found.count;
-            while (place > 0 && (far < distances[place - 1] ||
-                                 (far == distances[place - 1] && feature < found.features[place - 1]))) place--;
-            if (place == MESH_CONTACTS) continue;
-            if (found.count < MESH_CONTACTS) found.count++;
-            for (int q = found.count - 1; q > place; q--) {
-                distances[q] = distances[q - 1];
-                keys[q] = keys[q - 1];
-                found.features[q] = found.features[q - 1];
-            }
-            distances[place] = far;
-            Point order = {Number(ORDER_X), Number(ORDER_Y), Number(ORDER_Z)};
-            keys[place] = dot(offset, order) / greater(far, Number(1e-15));
-            found.features[place] = feature;
+            look_at(m, triangle, p, reach, found, nearest);
         }
     }
-    if (m.solid && along_nearest < Number(0)) {
+}
+
+// Finds the contacts of a sphere with a mesh; see `SurfaceMesh.features`.
+__device__ void find(const TriangleMesh& m, Point p, Number radius, Number margin, Searched& found) {
+    Number reach = (m.solid ? greater(radius, m.cell) : radius) + margin;
+    found.count = 0;
+    found.inside = false;
+    Point outside = beyond_box(m, p);
+    if (!(dot(outside, outside) < reach * reach)) return;
+    Nearest nearest;
+    nearest.distance = Number(1e30);
+    nearest.along = Number(0);
+    nearest.feature = 0;
+    if (reach < m.near_reach) look_nearby(m, p, reach, found, nearest);
+    else look_around(m, p, reach, found, nearest);
+    if (m.solid && nearest.along < Number(0)) {
         found.inside = true;
         found.count = 1;
-        found.features[0] = nearest_feature;
+        found.features[0] = nearest.feature;
         return;
     }
     for (int i = 1; i < found.count; i++) {  // so that each contact keeps its slot
-        for (int j = i; j > 0 && keys[j] < keys[j - 1]; j--) {
-            Number key = keys[j];
+        for (int j = i; j > 0 && nearest.keys[j] < nearest.keys[j - 1]; j--) {
+            Number key = nearest.keys[j];
             int feature = found.features[j];
-            keys[j] = keys[j - 1];
+            nearest.keys[j] = nearest.keys[j - 1];
             found.features[j] = found.features[j - 1];
-            keys[j - 1] = key;
+            nearest.keys[j - 1] = key;
             found.features[j - 1] = feature;
         }
     }
