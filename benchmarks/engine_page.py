@@ -41,6 +41,9 @@ ROWS = {
     "DreamerV3, 100 true trajectories, 4x": "DreamerV3, 4x",
 }
 """Rows of the page, in its order, and their names there."""
+LATER = "cgwm, later code"
+"""cgwm's row of an earlier report, fitted again."""
+ROWS[LATER] = "fitted again"
 LEARNED = tuple(name for name in ROWS if name.startswith(("PIN-WM", "DreamerV3")))
 DRAWN = 12
 """Captures of the learned rivals, in all."""
@@ -85,6 +88,10 @@ _POOLED = (
     "to cgwm: mm", "deg", "dB",
 )  # fmt: skip
 _OVER = ("row", "engines", "captures", "mm", "deg", "object PSNR dB", "friction error %", "to cgwm: mm", "deg", "dB")
+_SEEDS = (
+    "seed, commit", "task", "captures", "cgwm / floor, mm", "deg", "PSNR to the floor's, dB", "friction error %",
+    "intervals that hold",
+)  # fmt: skip
 _BARS = ("task", "captures", "cgwm / floor, mm", "cgwm / floor, deg", "PSNR to the floor's, dB")
 
 
@@ -125,7 +132,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     fresh, rows = [row for row in rows if row["seed"] >= FRESH], [row for row in rows if row["seed"] < FRESH]
     others = [row for row in rows if row["engine"] not in POOLED_WITHOUT]
     parts = [
-        _INTRODUCTION.replace("{rows}", "; ".join(name for name in ROWS if name not in LEARNED)),
+        _INTRODUCTION.replace("{rows}", "; ".join(name for name in ROWS if name not in (*LEARNED, LATER))),
         "## All engines but MuJoCo",
     ]
     for task in TASKS:
@@ -144,7 +151,14 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             parts.append(f"**{task.capitalize()}, {engine}**\n\n{_pooled(here)}")
     parts += [_JOINT, _joint(rows)]
     if fresh:
-        parts += _later(fresh)
+        parts.append(
+            "## Over seeds\n\nReports on captures of which nothing had been seen before, against Rapier and DART; and "
+            f"the first of them fitted again by later code.\n\n{_over_seeds([*others, *fresh])}"
+        )
+        seeds = sorted({row["seed"] for row in fresh}, reverse=True)
+        for seed in seeds:
+            title = "Fresh captures" if seed == seeds[0] else f"An earlier report, seed {seed}"
+            parts += _later(title, [row for row in fresh if row["seed"] == seed])
     parts += ["## Learned rivals by capture", _learned(rows)]
     parts += ["## Captures", _counts(rows), "## Not run", _not_run(rows)]
     return "\n\n".join(parts) + "\n"
@@ -167,13 +181,43 @@ def _joint(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _later(rows: Sequence[dict[str, Any]]) -> list[str]:
+def _over_seeds(rows: Sequence[dict[str, Any]]) -> str:
+    """Return cgwm beside the floor, its frictions and intervals by seed and task, and of all seeds together."""
+    lines, every = _head(_SEEDS), list[dict[str, Any]]()
+    floors = [row for row in rows if row["row"] == FLOOR]
+    for seed in sorted({row["seed"] for row in rows}):
+        for name in (REFERENCE, LATER):
+            mine = [row | {"row": REFERENCE} for row in rows if (row["seed"], row["row"]) == (seed, name)]
+            if not mine:
+                continue
+            commits = ", ".join(f"`{one[:7]}`" for one in sorted({row["commit"] for row in mine}))
+            every += mine if name == REFERENCE else []
+            lines += _seed_lines(f"{seed}{', again' if name == LATER else ''}, {commits}", mine, floors)
+    lines += _seed_lines("all, as reported", every, floors)
+    return "\n".join(lines)
+
+
+def _seed_lines(title: str, mine: Sequence[dict[str, Any]], floors: Sequence[dict[str, Any]]) -> list[str]:
+    lines = []
+    for task in (*TASKS, "all three"):
+        here = [row for row in (*mine, *floors) if task in (row["task"], "all three")]
+        bars = _beside_the_floor(here)
+        kept = [one for row in here if row["row"] == REFERENCE and "fit" in row for one in held(row)]
+        error = _friction(here, REFERENCE)
+        if bars is not None and error is not None:
+            share = f"{sum(kept)} of {len(kept)} ({100 * sum(kept) / len(kept):.0f} %)"
+            count, mm, deg, gap = bars
+            lines.append(f"| {title} | {task} | {count} | {mm:.2f} | {deg:.2f} | {gap:+.2f} | {error:.0f} | {share} |")
+    return lines
+
+
+def _later(title: str, rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return the parts of the page of a later report: by task, all three, against the floor, and which captures."""
     seeds, commits = ({row[key] for row in rows} for key in ("seed", "commit"))
     words = "Captures of which nothing was seen before (seed {}), at {}, all engines together.".format(
         ", ".join(map(str, sorted(seeds))), ", ".join(f"`{one[:7]}`" for one in sorted(commits))
     )
-    parts = [f"## Fresh captures\n\n{words}"]
+    parts = [f"## {title}\n\n{words}"]
     parts += [f"**{task.capitalize()}**\n\n{_pooled(here)}" for task in TASKS if (here := _of(rows, task=task))]
     parts += [f"**All three tasks**\n\n{_pooled(rows)}", f"**Against the floor**\n\n{_bars(rows)}"]
     there = [" ".join((task, obj, ground, engine)) for engine, task, obj, ground, _ in captures_of(rows, REFERENCE)]
@@ -269,17 +313,22 @@ def _bars(rows: Sequence[dict[str, Any]]) -> str:
     """Return how cgwm's medians compare with the floor's, on the captures that both have."""
     lines = _head(_BARS)
     for task in (*TASKS, "all three"):
-        here = [row for row in rows if task in (row["task"], "all three")]
-        mine, floor = captures_of(here, REFERENCE), captures_of(here, FLOOR)
-        both = [capture for capture in mine if capture in floor]
-        if both:
-            ratios = [
-                np.median([mine[c][key] for c in both]) / np.median([floor[c][key] for c in both])
-                for key in (_MM, _DEG)
-            ]
-            gap = float(np.median(-paired(floor, mine, _DB)))
-            lines.append(f"| {task} | {len(both)} | {ratios[0]:.2f} | {ratios[1]:.2f} | {gap:+.2f} |")
+        bars = _beside_the_floor([row for row in rows if task in (row["task"], "all three")])
+        if bars is not None:
+            lines.append("| {} | {} | {:.2f} | {:.2f} | {:+.2f} |".format(task, *bars))
     return "\n".join(lines)
+
+
+def _beside_the_floor(rows: Sequence[dict[str, Any]]) -> tuple[int, float, float, float] | None:
+    """Return on how many captures cgwm and the floor are, the ratios of their medians (mm, deg), and the gap in dB."""
+    mine, floor = captures_of(rows, REFERENCE), captures_of(rows, FLOOR)
+    both = [capture for capture in mine if capture in floor]
+    if not both:
+        return None
+    mm, deg = (
+        float(np.median([mine[c][key] for c in both]) / np.median([floor[c][key] for c in both])) for key in (_MM, _DEG)
+    )
+    return len(both), mm, deg, float(np.median(-paired(floor, mine, _DB)))
 
 
 def _pooled(rows: Sequence[dict[str, Any]]) -> str:

@@ -79,9 +79,18 @@ def test_a_later_report_stands_alone() -> None:
     rows += [row("cgwm", 600, [30.0], "def1234567"), row("floor", 600, [20.0], "def1234567")]
     text = engine_page.page([engine_page.reduced(one) for one in rows])
     first, later = text.split("## Fresh captures")
-    assert "| fall | 1 | 1.00 | 1.00 | +0.00 |" in first and "30.0" not in first
+    assert "| fall | 1 | 1.00 | 1.00 | +0.00 |" in first and "30.0" not in first.split("## Over seeds")[0]
     assert "(seed 600), at `def1234`" in later and "| all three | 1 | 1.50 | 1.00 | +0.00 |" in later
     assert "Captures: fall box wood rapier." in later
+    assert "| 600, `def1234` | fall | 1 | 1.50 | 1.00 | +0.00 | 10 | 1 of 1 (100 %) |" in first
+    rows += [row("cgwm", 700, [20.0]), row("floor", 700, [10.0]), row("cgwm, later code", 500, [5.0], "fed7654321")]
+    text = engine_page.page([engine_page.reduced(one) for one in rows])
+    over, newest, older = text.partition("## Over seeds")[2].split("\n## ")[:3]
+    assert newest.startswith("Fresh captures\n\nCaptures of which nothing was seen before (seed 700)")
+    assert older.startswith("An earlier report, seed 600")
+    assert (
+        "| 500, again, `fed7654` | all three | 1 | 0.50 |" in over and "| all, as reported | fall | 3 | 2.00 |" in over
+    )
 
 
 def test_a_draft_goes_on_where_it_stopped(tmp_path: Path) -> None:
