@@ -15,55 +15,80 @@ typedef double Many __attribute__((vector_size(32)));
 typedef long long ManyWhole __attribute__((vector_size(32)));
 #endif
 
-// exp(-m) for m from 0 to NEGLIGIBLE: 2^n times the series of a remainder below log(2) / 2.
-template <class V, class W> INLINE V fading(V m) {
+// exp(-m) for m from 0 to NEGLIGIBLE: 2^n times the series of a remainder below log(2) / 2. Of several numbers at once, as
+// each step of a series waits for the one before.
+template <class V, class W, int N> INLINE void fading(const V* m, V* e) {
     static const double each[] = {1.0 / 6227020800, 1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880,
                                   1.0 / 40320, 1.0 / 5040, 1.0 / 720, 1.0 / 120, 1.0 / 24, 1.0 / 6, 1.0 / 2, 1.0, 1.0};
     const V rounding = V{} + 6755399441055744.0;  // 1.5 * 2^52: the last bits of a sum with it are the whole number
-    const V shifted = rounding - m * 1.4426950408889634, whole = shifted - rounding;
-    const V rest = (-m - whole * 6.93147180369123816490e-01) - whole * 1.90821492927058770002e-10;  // log(2) in two parts
-    V sum = V{} + each[0], power;
-    for (int k = 1; k < 14; k++) sum = sum * rest + each[k];
-    W bits;
-    __builtin_memcpy(&bits, &shifted, sizeof bits);
-    bits = (bits + 1023) << 52;
-    __builtin_memcpy(&power, &bits, sizeof power);
-    return sum * power;
+    V rest[N], powers[N];
+    for (int n = 0; n < N; n++) {
+        const V shifted = rounding - m[n] * 1.4426950408889634, whole = shifted - rounding;
+        rest[n] = (-m[n] - whole * 6.93147180369123816490e-01) - whole * 1.90821492927058770002e-10;  // log(2) in two parts
+        W bits;
+        __builtin_memcpy(&bits, &shifted, sizeof bits);
+        bits = (bits + 1023) << 52;
+        __builtin_memcpy(&powers[n], &bits, sizeof bits);
+        e[n] = V{} + each[0];
+    }
+    for (int k = 1; k < 14; k++) {
+        for (int n = 0; n < N; n++) e[n] = e[n] * rest[n] + each[k];
+    }
+    for (int n = 0; n < N; n++) e[n] = e[n] * powers[n];
 }
 
 // log(1 + e) for e from 0 to 1: the series of 2 artanh of e / (2 + e), or of what 1 + e is to 2, which is nearer to 1.
-template <class V> INLINE V log_above_one(V e) {
+template <class V, int N> INLINE void log_above_one(const V* e, V* found) {
     static const double each[] = {2.0 / 23, 2.0 / 21, 2.0 / 19, 2.0 / 17, 2.0 / 15, 2.0 / 13,
                                   2.0 / 11, 2.0 / 9, 2.0 / 7, 2.0 / 5, 2.0 / 3, 2.0};
-    const auto high = e > 0.41421356237309503;
-    const V z = (high ? e - 1.0 : e) / (high ? e + 3.0 : e + 2.0), z2 = z * z;
-    V sum = V{} + each[0];
-    for (int k = 1; k < 12; k++) sum = sum * z2 + each[k];
-    return z * sum + (high ? V{} + 0.6931471805599453 : V{});
+    V z[N], z2[N];
+    for (int n = 0; n < N; n++) {
+        const auto high = e[n] > 0.41421356237309503;
+        z[n] = (high ? e[n] - 1.0 : e[n]) / (high ? e[n] + 3.0 : e[n] + 2.0);
+        z2[n] = z[n] * z[n];
+        found[n] = V{} + each[0];
+    }
+    for (int k = 1; k < 12; k++) {
+        for (int n = 0; n < N; n++) found[n] = found[n] * z2[n] + each[k];
+    }
+    for (int n = 0; n < N; n++) {
+        const auto high = e[n] > 0.41421356237309503;
+        found[n] = z[n] * found[n] + (high ? V{} + 0.6931471805599453 : V{});
+    }
 }
 
-// exp(-|x|) and the logistic function of x.
-template <class V, class W> INLINE V logistic(V x, V& e) {
-    const V most = V{} + NEGLIGIBLE, size = x < 0.0 ? -x : x;
-    e = fading<V, W>(size < most ? size : most);
-    return (x > 0.0 ? V{} + 1.0 : e) / (e + 1.0);
+// The logistic function of x, and exp(-|x|).
+template <class V, class W, int N> INLINE void logistic(const V* x, V* e, V* found) {
+    V size[N];
+    for (int n = 0; n < N; n++) {
+        const V most = V{} + NEGLIGIBLE;
+        size[n] = x[n] < 0.0 ? -x[n] : x[n];
+        size[n] = size[n] < most ? size[n] : most;
+    }
+    fading<V, W, N>(size, e);
+    for (int n = 0; n < N; n++) found[n] = (x[n] > 0.0 ? V{} + 1.0 : e[n]) / (e[n] + 1.0);
 }
 
-// SoftPlus with a sharpness of 1, and its slope.
-template <class V, class W> INLINE V soft_plus(V x, V& slope) {
-    V e;
-    slope = logistic<V, W>(x, e);
-    const V soft = (x > 0.0 ? x : V{}) + log_above_one<V>(e);
-    return x < -NEGLIGIBLE ? V{} : soft;
+// SoftPlus with a sharpness of 1, and its slope; the argument from LINEAR on.
+template <class V, class W, int N> INLINE void soft_plus(const V* x, V* soft, V* slope) {
+    V e[N];
+    logistic<V, W, N>(x, e, slope);
+    log_above_one<V, N>(e, soft);
+    for (int n = 0; n < N; n++) {
+        soft[n] = (x[n] > 0.0 ? x[n] : V{}) + soft[n];
+        soft[n] = x[n] < -NEGLIGIBLE ? V{} : soft[n];
+    }
 }
 
 INLINE Real sigmoid(Real x) {
 #if WIDE
-    Row e;
-    return Wide(logistic<Row, Marks>(x.of, e));
+    Row e, value;
+    logistic<Row, Marks, 1>(&x.of, &e, &value);
+    return Wide(value);
 #else
-    double e;
-    const double value = logistic<double, long long>(plain(x), e);
+    double e, value;
+    const double at = plain(x);
+    logistic<double, long long, 1>(&at, &e, &value);
 #if DUAL
     return Real(value, x.tangent * value * (1.0 - value));
 #else
@@ -79,23 +104,29 @@ INLINE void soften(Real* forces, Number sharpness) {
         return;
     }
 #if WIDE
+    Row exponent[PUBLISHED], soft[PUBLISHED], slope[PUBLISHED];
+    bool straight = true;
     for (int d = 0; d < PUBLISHED; d++) {
-        const Row x = forces[d].of, exponent = sharpness.of * x;
-        const Flag linear = Flag(exponent > LINEAR);
-        Row slope;
-        if (!every(linear)) forces[d] = choose(linear, forces[d], Wide(soft_plus<Row, Marks>(exponent, slope) / sharpness.of));
+        exponent[d] = sharpness.of * forces[d].of;
+        straight = straight && every(Flag(exponent[d] > LINEAR));
+    }
+    if (straight) return;
+    soft_plus<Row, Marks, PUBLISHED>(exponent, soft, slope);
+    for (int d = 0; d < PUBLISHED; d++) {
+        forces[d] = choose(Flag(exponent[d] > LINEAR), forces[d], Wide(soft[d] / sharpness.of));
     }
 #else
     for (int first = 0; first < PUBLISHED; first += 4) {
-        Many exponent = Many{} - 2 * NEGLIGIBLE, slope;
+        Many exponent = Many{} - 2 * NEGLIGIBLE, soft, slope;
         const int count = PUBLISHED - first < 4 ? PUBLISHED - first : 4;
-        bool bent = false;
+        bool straight = true;
         for (int k = 0; k < count; k++) {
             exponent[k] = sharpness * plain(forces[first + k]);
-            bent = bent || !(exponent[k] > LINEAR);
+            straight = straight && exponent[k] > LINEAR;
         }
-        if (!bent) continue;
-        const Many soft = soft_plus<Many, ManyWhole>(exponent, slope) / sharpness;
+        if (straight) continue;
+        soft_plus<Many, ManyWhole, 1>(&exponent, &soft, &slope);
+        soft = soft / sharpness;
         for (int k = 0; k < count; k++) {
             Real& force = forces[first + k];
             if (exponent[k] > LINEAR) continue;
@@ -240,26 +271,62 @@ INLINE Vec sum_of(const Parts& p) { return vec(sum_of(p.x), sum_of(p.y), sum_of(
 INLINE Part clamped(const Published& p, const Part& gap) {
     if (!(p.clamp_per_m > 0)) return gap;
     const Part far = gap + part(Real(p.zero_m)), deep = far + part(Real(p.clamp_depth_m));
-    Lot e;
-    const Lot value = logistic<Lot, LotWhole>(p.clamp_per_m * far.value, e);
+    const Lot x = p.clamp_per_m * far.value;
+    Lot e, value;
+    logistic<Lot, LotWhole, 1>(&x, &e, &value);
     const Part inside = PART(value, p.clamp_per_m * far.tangent * value * (1.0 - value));
     return inside * deep - part(Real(p.clamp_depth_m));
 }
 
-// As `softened`.
-INLINE Part softened(const Part& force, double sharpness) {
+// As `soften`.
+INLINE void soften(Part* forces, double sharpness) {
     if (!(sharpness > 0)) {
-        const LotWhole pushes = force.value >= 0.0;
-        Part p = PART(pushes ? force.value : Lot{}, pushes ? force.tangent : Lot{});
+        for (int d = 0; d < PUBLISHED; d++) {
+            const LotWhole pushes = forces[d].value >= 0.0;
+            Part p = PART(pushes ? forces[d].value : Lot{}, pushes ? forces[d].tangent : Lot{});
+            forces[d] = p;
+        }
+        return;
+    }
+    Lot exponent[PUBLISHED], soft[PUBLISHED], slope[PUBLISHED];
+    for (int d = 0; d < PUBLISHED; d++) exponent[d] = sharpness * forces[d].value;
+    soft_plus<Lot, LotWhole, PUBLISHED>(exponent, soft, slope);
+    for (int d = 0; d < PUBLISHED; d++) {
+        const LotWhole linear = exponent[d] > LINEAR;
+        Part p = PART(linear ? forces[d].value : soft[d] / sharpness, linear ? forces[d].tangent : forces[d].tangent * slope[d]);
+        forces[d] = p;
+    }
+}
+
+const int ABREAST_ROOM = (CONTACTS + 7) / 8 * 8 + 8;
+struct Closed {  // what is kept of the contacts that act, one after another: arms, velocities and gaps
+    double value[7][ABREAST_ROOM];
+#if DUAL
+    double tangent[7][ABREAST_ROOM];
+#endif
+    int count;
+    // Adds those of eight spheres that are marked.
+    INLINE void add(const Part* numbers, LotWhole marks) {
+        for (int j = 0; j < 8; j++) {
+            if (!marks[j]) continue;
+            for (int i = 0; i < 7; i++) {
+                value[i][count] = numbers[i].value[j];
+#if DUAL
+                tangent[i][count] = numbers[i].tangent[j];
+#endif
+            }
+            count++;
+        }
+    }
+    INLINE Part at(int i, int k) const {
+        Part p;
+        __builtin_memcpy(&p.value, value[i] + k, sizeof p.value);
+#if DUAL
+        __builtin_memcpy(&p.tangent, tangent[i] + k, sizeof p.tangent);
+#endif
         return p;
     }
-    const Lot exponent = sharpness * force.value;
-    const LotWhole linear = exponent > LINEAR;
-    Lot slope;
-    const Lot soft = soft_plus<Lot, LotWhole>(exponent, slope) / sharpness;
-    Part p = PART(linear ? force.value : soft, linear ? force.tangent : force.tangent * slope);
-    return p;
-}
+};
 
 // Adds the impulses of a body's spheres with the ground.
 INLINE void push_ground(const Problem& problem, const Environment& env, const Own&, int p, const Mat& rotation,
@@ -277,9 +344,12 @@ INLINE void push_ground(const Problem& problem, const Environment& env, const Ow
     const Parts one(first), two(second);
     const Part height = part(env.bodies[a].position.z - env.ground), h = part(law.step_s), friction = part(law.friction);
     const Part stiffness = part(law.stiffness), damping = part(law.damping);
-    Parts linear, angular;
+    const LotWhole places = {0, 1, 2, 3, 4, 5, 6, 7};
+    Closed closed;
+    closed.count = 0;
     for (int k = 0; k < count; k += 8) {
-        Part at[4] = {};
+        Part at[4];
+        for (int c = 0; c < 4; c++) at[c] = part(Real(0));
         for (int j = 0; j < 8; j++) {
             const Place row = env.geometry + 4LL * problem.spheres[start + (k + j < count ? k + j : count - 1)];
             for (int c = 0; c < 4; c++) {
@@ -296,21 +366,37 @@ INLINE void push_ground(const Problem& problem, const Environment& env, const Ow
         const Part low = dot(z, held) - at[3], gap = height + low;
         if (!any_of(gap.value <= far)) continue;
         const Parts arm(dot(x, held), dot(y, held), low), velocity = v + cross(omega, arm);
-        const LotWhole places = {0, 1, 2, 3, 4, 5, 6, 7};
-        const LotWhole closed = (gap.value < 0.0) | (gap.value + h.value * velocity.z.value < 0.0);
-        const LotWhole on = closed & (places < (long long)(count - k));
-        if (!any_of(on)) continue;
-        const Part distance = clamped(env.published, gap), along_one = dot(velocity, one), along_two = dot(velocity, two);
-        Part normal = part(Real(0)), across = normal, beside = normal;
+        const LotWhole acting = (gap.value < 0.0) | (gap.value + h.value * velocity.z.value < 0.0);
+        const Part numbers[7] = {arm.x, arm.y, arm.z, velocity.x, velocity.y, velocity.z, gap};
+        closed.add(numbers, acting & (places < (long long)(count - k)));
+    }
+    Parts linear, angular;
+    for (int k = 0; k < closed.count; k += 8) {
+        for (int j = closed.count; j < k + 8; j++) {  // any finite numbers
+            for (int i = 0; i < 7; i++) closed.value[i][j] = 0.0;
+#if DUAL
+            for (int i = 0; i < 7; i++) closed.tangent[i][j] = 0.0;
+#endif
+        }
+        const LotWhole on = places < (long long)(closed.count - k);
+        const Parts arm(closed.at(0, k), closed.at(1, k), closed.at(2, k));
+        const Parts velocity(closed.at(3, k), closed.at(4, k), closed.at(5, k));
+        const Part distance = clamped(env.published, closed.at(6, k));
+        const Part along_one = dot(velocity, one), along_two = dot(velocity, two);
+        Part forces[PUBLISHED];
         for (int d = 0; d < PUBLISHED; d++) {
             const Part facing = part(Real(facet_x(d))), other = part(Real(facet_y(d)));
             const Part along = velocity.z - friction * (facing * along_one + other * along_two);
-            const Part force = part(Real(0)) - stiffness * (h * along + distance) - damping * along;
-            const Part all = h * softened(force, env.published.softplus_per_n);
+            forces[d] = part(Real(0)) - stiffness * (h * along + distance) - damping * along;
+        }
+        soften(forces, env.published.softplus_per_n);
+        Part normal = part(Real(0)), across = normal, beside = normal;
+        for (int d = 0; d < PUBLISHED; d++) {
+            const Part all = h * forces[d];
             const Part impulse = PART(on ? all.value : Lot{}, on ? all.tangent : Lot{});
             normal = normal + impulse;
-            across = across - facing * impulse;
-            beside = beside - other * impulse;
+            across = across - part(Real(facet_x(d))) * impulse;
+            beside = beside - part(Real(facet_y(d))) * impulse;
         }
         const Parts impulse = normal * Parts(up) + (friction * across) * one + (friction * beside) * two;
         linear = linear + impulse;
