@@ -5,11 +5,18 @@ from __future__ import annotations
 from ...datasets.capture.capture import Capture
 from ...datasets.models.joints import refuse_joints
 from ...schemas import ModelFile, PhysConfig, UsageError
+from ..physics.body import Body
+from ..physics.hull import Hull
+from ..physics.paper_law import PaperLaw, stable_step
+from ..physics.smooth_distance import plane_contacts
+from ..physics.world import World
 
 STEP_S = 2.5e-4
 """Step where none is asked for [s]. A flat side of 80 spheres has 320 rows, for which one explicit evaluation is stable
 up to 0.25 ms at a natural time of 10 ms and a damping ratio of 1.8, one standard deviation of the priors from their
 medians (`stable_step`); with 1 ms, our law's step, bodies that fell on such a side were thrown off."""
+SIDE_M = 1e-3
+"""Depth within which spheres touch a plane at once [m]."""
 _PARTS = ("mass_distribution", "length_scale")
 
 
@@ -44,3 +51,30 @@ def paper_config(file: ModelFile, capture: Capture, config: PhysConfig) -> PhysC
     step_s = config.step_s if "step_s" in config.model_fields_set else STEP_S
     given = {**dict.fromkeys(_PARTS, False), "geometry": config.geometry is not False, "step_s": step_s}
     return config.model_copy(update=given)
+
+
+def unstable_sides(world: World) -> tuple[str, ...]:
+    """Return warnings where the paper's law is not stable for a free body that lies on its widest side."""
+    law, found = world.contact, []
+    for body in world.bodies:
+        if not body.free or not isinstance(law, PaperLaw):
+            continue
+        count = widest_side(body)
+        most_s = float(stable_step(law, body.mass, law.directions * count).min())
+        if world.step_s > most_s:
+            found.append(
+                f"the paper's law with these numbers is not stable where body '{body.name}' lies on {count} spheres at "
+                f"once: its step is {1e3 * world.step_s:.3g} ms, and up to {1e3 * most_s:.2g} ms are. Predictions may "
+                f"be thrown off; fit with --set phys-geo.step_s={0.9 * most_s:.1g}"
+            )
+    return tuple(found)
+
+
+def widest_side(body: Body) -> int:
+    """Return the largest number of a body's spheres that the plane of a face of their hull touches at once."""
+    centers, radii = body.centers[0], body.radii[0]
+    hull = body.hull or Hull.of(centers, radii, plane_contacts(centers, radii))
+    if hull is None:
+        return 1
+    reach = centers @ hull.faces[:, :3].T + radii[:, None]
+    return int((reach > reach.amax(0) - SIDE_M).sum(0).max())

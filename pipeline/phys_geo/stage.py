@@ -44,7 +44,7 @@ from ..trajectories.frame_times import with_regular_times
 from ..trajectories.observations import track_episodes
 from .effects.requested_effects import fit_with_effects, fitted_effects, with_effects
 from .material_pairs import start_laws, with_pusher_law
-from .paper_setting import paper_config
+from .paper_setting import paper_config, unstable_sides
 from .surface_starts import require_outside
 from .tracks.contact_result import PhysicsFit
 from .tracks.earlier_estimates import GROUND, EarlierEstimates
@@ -94,6 +94,9 @@ def fit_motion(
     fitted = _merge(ready.file, world_of_model(ready), found)
     fit_file = FitFile(stages=ready.fit.stages | {"phys-geo": record})
     ready = replace(_with_collision(ready, found.collision), file=fitted, fit=fit_file, tracks=found.tracks)
+    if config.contact_law == "paper":
+        doubts = unstable_sides(world_of_model(ready))
+        ready = replace(ready, file=ready.file.model_copy(update={"warnings": (*ready.file.warnings, *doubts)}))
     if config.supervise == "tracks" and not ready.file.articulations:
         free = {body.name for body in ready.file.bodies if body.motion == "free"}
         timed = with_regular_times(track_episodes(capture, split), free)[0]

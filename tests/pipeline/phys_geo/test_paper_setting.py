@@ -10,13 +10,15 @@ from cgwm.datasets.models.mjcf import write_mjcf
 from cgwm.datasets.models.model import read_model, write_model
 from cgwm.pipeline.control.task_world import require_rigid
 from cgwm.pipeline.diagnose import stage
-from cgwm.pipeline.phys_geo.paper_setting import paper_config
+from cgwm.pipeline.phys_geo.paper_setting import paper_config, unstable_sides, widest_side
 from cgwm.pipeline.physics import ContactLaw, PaperLaw, world_of_model
+from cgwm.pipeline.physics.engine import rollout
 from cgwm.pipeline.physics.paper_law import stable_step
 from cgwm.pipeline.physics.parameters import apply_parameters, contact_parameters
 from cgwm.schemas import Body, CaptureManifest, Ground, InputDataError, Material, PhysConfig, UsageError
 from cgwm.schemas import World as Surroundings
 from helpers.small_model import MASS, small_model
+from helpers.worlds import batch, box_body, state_of, times, world_of
 from pydantic import ValidationError
 
 PAPER = PhysConfig(contact_law="paper")
@@ -77,6 +79,23 @@ def test_its_steps_are_short_enough_for_flat_sides_unless_others_are_asked_for()
     assert 0.9 * step_s < float(stable_step(law, MASS * one, 80 * 4)) < 4 * step_s
     asked = PhysConfig(contact_law="paper", step_s=0.002)
     assert paper_config(small_model().file, capture(), asked).step_s == 0.002
+
+
+def test_numbers_that_are_not_stable_on_a_wide_side_are_told() -> None:
+    """A plate of 100 spheres below and 100 above, on which it stays within the bound, and is thrown up beyond it."""
+    grid = torch.linspace(-0.05, 0.05, 10, dtype=torch.float64)
+    centers = torch.cartesian_prod(grid, grid, torch.tensor([-0.01, 0.01], dtype=torch.float64))
+    body = replace(box_body(mass=MASS), centers=centers[None], radii=torch.full((1, 200), 0.005, dtype=torch.float64))
+    numbers = batch(0.5), batch(0.01), batch(1.8)
+    world = world_of(body, contact=PaperLaw.of_body(*numbers, MASS, 9.81 * MASS), step_s=1e-4)
+    (told,) = unstable_sides(replace(world, step_s=1e-3))
+    assert widest_side(body) == 100 and "lies on 100 spheres" in told and unstable_sides(world) == ()
+    start = state_of(((0, 0, 0.0149), (1, 0, 0, 0), (0, 0, -0.3), (0, 0, 0)))
+    speeds = [
+        float(rollout(replace(world, step_s=step_s), start, times(0.3)).velocity_m_s[..., 2].max())
+        for step_s in (1e-4, 1e-3)
+    ]
+    assert speeds[0] < 0.1 and speeds[1] > 0.3
 
 
 def test_an_unknown_law_is_refused_with_the_two_there_are() -> None:
