@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ...optimization.tails import chi2_tail, f_tail
 from ...optimization.uncertainty import few_covariance
 from ...physics.world import World
-from ...segments.candidates import base_values
+from ...segments.candidates import Variant, base_values
 from ...segments.linearization import Linearization, eliminate, layout, linearize, sums, widths
 from ...segments.segments import Segments
 from ..thresholds import THRESHOLDS
@@ -114,7 +114,12 @@ def _over(
 
 
 def fitted_numbers(
-    flight: Segments, world: World, names: Sequence[str], groups: Sequence[int], dispersion: float
+    flight: Segments,
+    world: World,
+    names: Sequence[str],
+    groups: Sequence[int],
+    dispersion: float,
+    own: Sequence[tuple[Variant, bool]] = (),
 ) -> dict[str, dict[str, tuple[float, float]]]:
     """Return the parameters of effects of a world with standard errors that hold the scatter between episodes.
 
@@ -127,30 +132,69 @@ def fitted_numbers(
         names: Names of effects with one value for all episodes.
         groups: Session of each episode.
         dispersion: Factor by which variances exceed those of the noise.
+        own: Effects that have a value for each episode, or else for each session, which are found beside the numbers.
 
     Returns:
         Value and standard error by parameter, by effect.
     """
-    linear = linearize(flight, world, (), groups, robust=False) if names else None
+    linear = linearize(flight, world, [variant for variant, _ in own], groups, robust=False) if names else None
     if linear is None:
         return {}
-    every = list(range(len(linear.parameters)))
+    beside = [linear.columns(variant.parameters) for variant, _ in own]
+    every = [k for k in range(len(linear.parameters)) if all(k not in columns for columns in beside)]
+    for columns, (_, by_episode) in zip(beside, own, strict=True):
+        linear = _beside_own(linear, every, columns, by_episode, dispersion)
     bare = replace(linear, prior=np.zeros_like(linear.prior))
     information, score = sums(bare, every)
     scores = np.array([sums(bare.only_episode(int(one)), every)[1] for one in np.unique(linear.episode)])
     prior = sums(linear, every)[0] - information
+    # an effect with values of their own may have been found after the others, and moves their numbers
+    step = np.linalg.solve(information / dispersion + prior, score / dispersion) if own else np.zeros(len(score))
     # a fit that stopped early has a slope left, which is no scatter
     scores = (scores - score / len(scores)) / dispersion
     std = np.sqrt(np.diag(few_covariance(information / dispersion + prior, scores, prior)))
-    place = {p.name: int(k) for p, k in zip(linear.parameters, layout(linear, every)[0][0], strict=True)}
+    own_names = [linear.parameters[k].name for k in every]
+    place = {name: int(k) for name, k in zip(own_names, layout(linear, every)[0][0], strict=True)}
     return {
         active.effect.name: {
-            p.name: (float(active.values[p.name][0]), float(std[place[f"{active.effect.name}.{p.name}"]]))
+            p.name: (float(active.values[p.name][0]) + float(step[at]), float(std[at]))
             for p in active.effect.parameters
+            for at in [place[f"{active.effect.name}.{p.name}"]]
         }
         for active in world.effects
         if active.effect.name in names
     }
+
+
+def _beside_own(
+    linear: Linearization, kept: Sequence[int], columns: Sequence[int], by_episode: bool, dispersion: float
+) -> Linearization:
+    """Return a linearization in which an effect is free in each episode or session, beside the parameters `kept`.
+
+    Args:
+        linear: The linearization.
+        kept: Parameters whose information is what values of their own leave.
+        columns: Parameters of the effect.
+        by_episode: Whether each episode has a value, else each session.
+        dispersion: Factor by which variances exceed those of the noise, in which the priors are given.
+    """
+    owner = linear.episode if by_episode else linear.group
+    information, score = linear.information.copy(), linear.score.copy()
+    rest = [*kept, *(k for k in range(len(linear.parameters)) if k not in (*kept, *columns))]
+    for one in np.unique(owner):
+        mine = np.flatnonzero(owner == one)
+        weight = linear.weight[mine, None, None]
+        shared = (information[mine] * weight).sum(0)
+        own = shared[np.ix_(columns, columns)] + dispersion * np.diag(linear.prior[list(columns)])
+        along = np.linalg.solve(own, shared[np.ix_(columns, rest)]).T
+        # each flight without what the values of its owner explain of it
+        between = information[mine][:, rest][:, :, columns]
+        explained = between @ along.T
+        inner = along @ information[mine][:, columns][:, :, columns] @ along.T
+        cleaned = information[mine][:, rest][:, :, rest] - explained - explained.transpose(0, 2, 1) + inner
+        information[mine[:, None, None], np.array(rest)[None, :, None], np.array(rest)[None, None, :]] = cleaned
+        score[mine[:, None], np.array(rest)[None]] -= linear.score[mine][:, columns] @ along.T
+    return replace(linear, information=information, score=score)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from ...physics.parameters import effect_parameters
 from ...physics.world import World
-from ...segments.candidates import Candidate, base_parameters, without_effects
+from ...segments.candidates import Candidate, base_parameters, variants_of, without_effects
 from ...segments.flights.slow_errors import SlowErrors
 from ...segments.prepare import Prepared
 from ...segments.segment_fit import refit
@@ -57,7 +57,12 @@ class FlightSelection(NamedTuple):
         """Give the numbers of the effects standard errors that hold the scatter between episodes."""
         if self.flight is None or not self.names:
             return self
-        numbers = fitted_numbers(self.flight, self.world, self.names, groups, scatter)
+        own = []
+        for step in self.steps:
+            if step.flagged and step.own_std is not None:
+                variants = variants_of([step.best.candidate], self.world.gravity[0, :1])
+                own += [(variants[0], step.best.name.endswith("@episode"))] if len(variants) == 1 else []
+        numbers = fitted_numbers(self.flight, self.world, self.names, groups, scatter, own)
         return self._replace(steps=[_with_numbers(step, numbers) for step in self.steps])
 
     def without(self, names: set[str]) -> FlightSelection:
