@@ -17,6 +17,7 @@ from ..physics.rollout import Rollout, require_finite
 from ..physics.world import World
 from ..trajectories.initial_state import estimate_states, warmup_frames
 from ..trajectories.observations import Observations
+from ..trajectories.rolling_start import rolling_items
 from ..trajectories.state_uncertainty import StartUncertainty
 from ..trajectories.track_noise import Noise
 
@@ -81,6 +82,8 @@ class EpisodePrediction:
     """Expected error due to the uncertainty of the initial state alone [m]."""
     state_fitted_m: float | None
     """Error of the model from the state fitted to the whole episode [m]; None if not computed."""
+    rolls: bool = False
+    """Whether its spin, which nothing measured, is that of a ball that rolls."""
 
     @property
     def warmup_end_s(self) -> float:
@@ -165,6 +168,8 @@ class _Batch:
     """Whether a frame belongs to the warm-up, shape (B, T)."""
     covariance: Tensor
     """Covariance of the initial states, by episode."""
+    rolling: Tensor
+    """Episodes whose spin is that of a ball that rolls, shape (B,)."""
 
     @staticmethod
     def of(world: World, episodes: Sequence[Episode], noise: Noise, warmup_s: float) -> _Batch:
@@ -172,7 +177,8 @@ class _Batch:
         observations = Observations.of(world, episodes, everything)
         warm = warmup_frames(world, observations, warmup_s)
         observations, solution = estimate_states(world, observations, warm, noise, WARMUP_ITERATIONS)
-        return _Batch(world, observations, warm, solution.state_cov)
+        rolling = rolling_items(world, observations, warm)
+        return _Batch(world, observations, warm, solution.state_cov, rolling)
 
     def weight(self) -> Tensor:
         """Return the weights of the frames after the warm-up, shape (B, T, nf)."""
@@ -226,6 +232,7 @@ class _Batch:
             motions={MODEL: model},
             noise_floor_m=float("nan"),
             state_fitted_m=None,
+            rolls=bool(self.rolling[item]),
         )
         prediction.motions[FROZEN] = _frozen(prediction, model, last)
         prediction.motions[BALLISTIC] = _ballistic(self.world, grid, rollout, item, model, last)

@@ -173,6 +173,7 @@ def evaluate_model(
     world, fitted = _worlds_with_random_effects(world, model, capture, episodes, noise, warnings, brief)
     warmup_s = _outlasted(warmup_s, episodes, warnings)
     predictions = _predict(model, world, episodes, noise, warmup_s, video_times, fits, fitted)
+    warnings += _assumed_spins(predictions)
 
     def compare(prediction: EpisodePrediction) -> tuple[VideoComparison, ...]:
         names = cameras.get(prediction.episode, [])
@@ -341,6 +342,18 @@ def _predict(
     bar = progress(desc="eval: rollouts", total=len(episodes), unit="episode")
     with checked_work(world, episodes, state_fits), bar:
         return predict(world, episodes, noise, warmup_s, video_times, bar.update, state_fits, fitted)
+
+
+def _assumed_spins(predictions: Sequence[EpisodePrediction]) -> list[str]:
+    """Return what was assumed of spins that nobody measured."""
+    rolling = [f"'{one.episode}'" for one in predictions if one.rolls]
+    if not rolling:
+        return []
+    begin = f"episode {rolling[0]} begins" if len(rolling) == 1 else f"{len(rolling)} episodes begin"
+    return [
+        f"{begin} in contact without measured turns: the ball is taken to roll with the velocity of its warm-up, as "
+        "far as the model's friction lets it."
+    ]
 
 
 def _outlasted(warmup_s: float, episodes: Sequence[Episode], warnings: list[str]) -> float:

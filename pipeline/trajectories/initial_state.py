@@ -17,6 +17,7 @@ from ..physics.surfaces.detection import surface_gap
 from ..physics.world import World
 from .observations import START_FRAMES, Observations, straight_line
 from .residuals import STATE_SIZE, TrajectoryResiduals, retract, state_prior
+from .rolling_start import PASSES, SPIN_LEAST_RAD_S, SPIN_SHARE, rolling_items, with_rolling
 from .track_noise import Noise
 
 MIN_FRAMES = 4
@@ -28,6 +29,10 @@ LINE_MISFIT = 2.0
 """Maximum mean square residual, in units of the noise variance, of frames that lie on a straight line."""
 LINE_SPREAD = 2.0
 """Prior standard deviation of a velocity in contact about that of such a line, in standard errors of the line."""
+
+
+HELD = 1e8
+"""Information [1/rad2] that holds an orientation which nothing measured."""
 
 
 def clearance(world: World, observations: Observations) -> Tensor:
@@ -128,6 +133,20 @@ def estimate_states(
         seen=observations.seen[:, :last] * keep,
         has_orientation=observations.has_orientation[:, :last] * keep,
     )
+    rolling = rolling_items(world, warm, frames[:, :last])
+    if not bool(rolling.any()):
+        return _fitted_states(world, observations, warm, noise, iterations, rolling)
+    for _ in range(PASSES):
+        observations = with_rolling(world, observations, rolling)
+        warm = replace(warm, state=observations.state)
+        observations, solution = _fitted_states(world, observations, warm, noise, iterations, rolling)
+    return observations, solution
+
+
+def _fitted_states(
+    world: World, observations: Observations, warm: Observations, noise: Noise, iterations: int, rolling: Tensor
+) -> tuple[Observations, Solution]:
+    """Return the observations with the states fitted to the frames of `warm`, and the solution."""
     like = world.gravity
     states = torch.zeros(len(observations.names), 12 * len(observations.free)).to(like)
     nothing = torch.zeros(0).to(like)
@@ -138,35 +157,42 @@ def estimate_states(
         torch.zeros(0, 2).to(like),
         robust_scale=5.0,
         iterations=iterations,
-        prior_information=_information(world, warm, noise),
+        prior_information=_information(world, warm, noise, rolling),
     )
     moved = on_joints(world, retract(observations.state, solution.states, observations.free))
     return replace(observations, state=moved), solution
 
 
-def _information(world: World, warm: Observations, noise: Noise) -> Tensor:
+def _information(world: World, warm: Observations, noise: Noise, rolling: Tensor) -> Tensor:
     """Return the information (B, S) of the prior on state changes, tighter for a body in contact that moves evenly.
 
     Contact removes a velocity at once, so that later frames do not determine it: the fit would use it to follow the
-    noise of the first frame, and a body at rest would start with a hop.
+    noise of the first frame, and a body at rest would start with a hop. Items that roll (B,) keep near their spin.
     """
     bodies = len(warm.free)
     information = state_prior(bodies).to(world.gravity).repeat(len(warm.names), 1)
+    if bool(rolling.any()):
+        spin = warm.state.omega_body_rad_s[rolling, warm.free[0]].norm(dim=-1)
+        information[rolling, 3:6] = HELD  # a turn would turn the spin with it
+        information[rolling, 9:12] = (SPIN_SHARE * spin).clamp_min(SPIN_LEAST_RAD_S).pow(-2)[:, None]
     touching = clearance(world, warm)[:, 0] <= FLIGHT_MARGIN_M
     for item in touching.nonzero()[:, 0].tolist():
         for column in range(bodies):
-            at = torch.nonzero(warm.seen[item, :, column] * warm.has_orientation[item, :, column])[:START_FRAMES, 0]
+            rolls = bool(rolling[item])
+            known = warm.seen[item, :, column] * (1 if rolls else warm.has_orientation[item, :, column])
+            at = torch.nonzero(known)[:START_FRAMES, 0]
             if len(at) < 3:
                 continue
             t = warm.times_s[item, at] - warm.times_s[item, 0]
-            measured = warm.quat_wxyz[item, at, column]
-            turn = continuous_turns(t, measured)
-            rows = torch.stack([warm.position_m[item, at, column] / noise.position_m, turn / noise.rotation_rad])
-            lines = [straight_line(t, values) for values in rows]
-            away = torch.stack([v - (a + t[:, None] * b) for v, (a, b) in zip(rows, lines, strict=True)])
-            if float(away.square().sum()) < LINE_MISFIT * 6 * (len(at) - 2):
+            measured = [warm.position_m[item, at, column] / noise.position_m]
+            if not rolls:
+                turn = continuous_turns(t, warm.quat_wxyz[item, at, column])
+                measured.append(turn / noise.rotation_rad)
+            lines = [straight_line(t, values) for values in measured]
+            away = torch.stack([v - (a + t[:, None] * b) for v, (a, b) in zip(measured, lines, strict=True)])
+            if float(away.square().sum()) < LINE_MISFIT * 3 * len(measured) * (len(at) - 2):
                 spread = LINE_SPREAD / (t - t.mean()).square().sum().sqrt()
                 first = STATE_SIZE * column + 6
-                for place, sigma in zip((first, first + 3), noise, strict=True):
+                for place, sigma in zip((first, first + 3)[: len(measured)], noise, strict=False):
                     information[item, place : place + 3] += 1 / (sigma * spread).square()
     return information

@@ -17,6 +17,7 @@ from ...physics.state import State
 from ...physics.world import World
 from ...trajectories.initial_state import FLIGHT_MARGIN_M, clearance, separate_frames
 from ...trajectories.observations import Observations
+from ...trajectories.rolling_start import rolling_items, with_rolling
 from ...trajectories.track_noise import Noise
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ SEGMENT_S = 0.03
 """Minimum duration of a segment [s]; segments begin and end at frames."""
 RESTING_SIGMAS = 6.0
 """Maximum motion in a segment, in standard deviations of the noise, of a body that may be at rest."""
+
+BESIDE = 2
+"""Number of frames on both sides of the first one of a segment in which a ball has to touch to count as rolling."""
 
 _Piece = tuple[int, int, int]
 """Part of an episode: its number, and its first and last frame."""
@@ -70,8 +74,9 @@ class TiedSegments:
             end.append(int((segments.times_s[row] <= windows[row][1]).sum()) - 1)
             if not last:  # the next segment has seen that frame
                 seen[row, end[-1] :], turned[row, end[-1] :] = 0.0, 0.0
-        ahead = segments.state
-        state = _moving(world, whole, items, [first for _, first, _ in pieces], ahead)
+        starts = [first for _, first, _ in pieces]
+        ahead = _with_spins(world, whole, items, starts, segments.state)
+        state = _moving(world, whole, items, starts, ahead)
         return TiedSegments(
             segments=replace(segments, seen=seen, has_orientation=turned, state=state),
             following=torch.tensor(following),
@@ -241,7 +246,18 @@ def _moving(world: World, whole: Observations, items: list[int], starts: list[in
             velocity[row, body] = torch.stack(rates).mean(0)
             if bool(whole.has_orientation[item, frame, column]):  # else the spin is that of the first guess
                 omega[row, body] = torch.stack(turns).mean(0)
-    return replace(state, velocity_m_s=velocity, omega_body_rad_s=omega)
+    moved = replace(state, velocity_m_s=velocity, omega_body_rad_s=omega)
+    return _with_spins(world, whole, items, starts, moved)
+
+
+def _with_spins(world: World, whole: Observations, items: list[int], starts: list[int], state: State) -> State:
+    """Return states (B) at frames, with the spins of balls that roll there, which nothing measured tells."""
+    number = torch.arange(whole.times_s.shape[1])
+    frame = torch.tensor(starts)[:, None]
+    around = (number >= frame - BESIDE) & (number <= frame + BESIDE)
+    begun = replace(whole.select(items), state=state)
+    rolling = rolling_items(world, begun, around)
+    return with_rolling(world, begun, rolling).state if bool(rolling.any()) else state
 
 
 def _neighbours(frame: int, count: int, flying: Tensor) -> list[int]:

@@ -18,6 +18,7 @@ from ...physics.contact_detection import FAR_M, Placed
 from ...physics.surfaces.detection import points_within
 from ...physics.world import World
 from ...trajectories.observations import Observations
+from ...trajectories.rolling_start import without_slip
 from ..thresholds import SEGMENT_THRESHOLDS
 
 LIMITS = SEGMENT_THRESHOLDS.sliding_data
@@ -77,13 +78,7 @@ class Support:
     def rolling(self, within_m: float, velocity_m_s: Tensor, radius_m: float) -> Tensor:
         """Return the smallest spins (n, 3) [rad/s] with which a ball rolls on these contacts without slip."""
         weight = self.weights(within_m)
-        x, y, z = self.normal.unbind(-1)
-        zero = torch.zeros_like(x)
-        # omega x r n = -r [n] omega
-        turned = -radius_m * torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
-        rows = (weight[..., None, None] * turned).flatten(1, 2)
-        wanted = (weight[..., None] * velocity_m_s[:, None]).flatten(1)
-        return (torch.linalg.pinv(rows, rtol=0.3) @ wanted[..., None]).squeeze(-1)
+        return without_slip(self.normal, weight, velocity_m_s, radius_m)
 
 
 @dataclass(frozen=True)

@@ -171,6 +171,10 @@ INLINE bool is_beside(const TriangleMesh& m, int triangle, Point p, Number reach
     if (!(high < reach)) return true;
     int below = height < Number(0), open = (int)prism[14 + below];
     Number slack = Number(1e-5) * reach, most = prism[12 + below] * high + slack;
+    if (!open) {
+        return dot(a, point(prism + 3)) > most || dot(a, point(prism + 9)) > most ||
+               dot(p - point(corners + 3), point(prism + 6)) > most;
+    }
     Number out[3] = {dot(a, point(prism + 3)), dot(p - point(corners + 3), point(prism + 6)), dot(a, point(prism + 9))};
     bool beyond = false;
     for (int k = 0; k < 3; k++) {
