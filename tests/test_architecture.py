@@ -127,7 +127,7 @@ def test_diagnose_reaches_a_part_of_the_pipeline() -> None:
     """Counted in lines: to divide a module makes nobody read more."""
     found = import_graph.modules()
     reached = import_graph.reach(import_edges(), "cli.diagnose")
-    assert sum(len(found[name].read_text(encoding="utf-8").splitlines()) for name in reached) <= 35_800
+    assert sum(len(found[name].read_text(encoding="utf-8").splitlines()) for name in reached) <= 36_200
 
 
 def test_every_message_to_a_user_says_what_to_do_next() -> None:
