@@ -41,6 +41,7 @@ from ...physics.paper_law import PaperLaw
 from ...physics.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_TIME,
+    FRICTION,
     GROUND_SHIFT,
     Parameter,
     apply_parameters,
@@ -81,7 +82,7 @@ from .glides import fit_gliding_joints
 from .inertia_fit import MASS_PARTS, fit_mass_distribution
 from .joint_fit import fit_joints
 from .measured_forces import measured_forces
-from .open_loop_search import ENOUGH_EPISODES, SearchBatch, open_loop_errors, search_contact
+from .open_loop_search import ENOUGH_EPISODES, SearchBatch, friction_on_ice, open_loop_errors, search_contact
 from .part_choice import SCALE, asked_parts, choose_parts, without_contradicted
 
 MAX_SPAN_S = 0.8
@@ -396,8 +397,7 @@ def _searched(
     """
     search = search_contact(ready.world, batch, ready.start, data.noise, config, warm_started)
     flying = flight_frames(ready.world, batch.observations)[:, 0]
-    glides = not (flying.all() or ready.world.chains or batch.observations.drives)
-    for _ in range(SEARCHES - 1 if glides else 0):
+    for _ in range(SEARCHES - 1 if _glides(ready, batch) else 0):
         values = [p.decode(torch.tensor([value])) for (p, _), value in zip(ready.start, search.mean, strict=True)]
         names = [p for p, _ in ready.start]
         again = _with_initial_states(
@@ -409,6 +409,26 @@ def _searched(
         start = [(p, float(value)) for p, value in zip(names, values, strict=True)]
         search = search_contact(ready.world, batch, start, data.noise, config, warm_started=True, near=True)
     return batch, search
+
+
+def _glides(ready: _Ready, batch: SearchBatch) -> bool:
+    """Return whether a body slides or rolls in an episode from its first frame on, and nothing drives it."""
+    flying = flight_frames(ready.world, batch.observations)[:, 0]
+    return not (flying.all() or ready.world.chains or batch.observations.drives)
+
+
+def _on_ice(ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfig) -> tuple[_Ready, SearchBatch]:
+    """Return the start at a friction far below that of usual materials, where bodies that glide ask for it."""
+    friction = friction_on_ice(ready.world, batch, ready.start) if _glides(ready, batch) else None
+    if friction is None:
+        return ready, batch
+    start = [
+        (replace(p, prior=(friction, p.prior[1])), friction) if p.name == FRICTION.name else (p, value)
+        for p, value in ready.start
+    ]
+    values = torch.tensor([[value for _, value in start]]).to(ready.world.gravity)
+    world = apply_parameters(ready.world, [p for p, _ in start], values)
+    return replace(ready, start=start), _with_initial_states(world, data, config.warmup_s)
 
 
 def _moved(before: SearchBatch, after: SearchBatch, flying: Tensor) -> bool:
@@ -424,6 +444,7 @@ def _contact_estimate(
     ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfig, warm_started: bool, record: FitRecord
 ) -> tuple[ContactEstimate, FitRecord]:
     """Return the contact parameters by the search, refined by shooting where there are few episodes."""
+    ready, batch = _on_ice(ready, data, batch, config)
     batch, search = _searched(ready, data, batch, config, warm_started)
     record = replace(record, search_open_loop_m=search.history, search_effective_samples=search.effective_samples)
     covariance = episode_covariance(search, ENOUGH_EPISODES)

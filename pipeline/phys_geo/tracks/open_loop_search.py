@@ -15,7 +15,7 @@ from ....schemas import NotConvergedError, PhysConfig
 from ...geometry.rotation import geodesic_angle
 from ...optimization.importance_sampling import NormalPrior, SearchResult, importance_search
 from ...physics.observation_model import measure
-from ...physics.parameters import Parameter, apply_parameters
+from ...physics.parameters import FRICTION, Parameter, apply_parameters
 from ...physics.world import World
 from ...trajectories.observations import Observations
 from ...trajectories.track_noise import Noise
@@ -37,6 +37,10 @@ SEVERAL_EPISODES = 3
 ENOUGH_EPISODES = 8
 """Minimum number of episodes for using the search alone: their mean error is smooth, and their scatter gives intervals
 that do not rely on the model."""
+
+ICE, ICE_SHARE = (0.004, 0.01, 0.02, 0.04, 0.08), 0.8
+"""Frictions that are tried where bodies glide from the start, and the share of the error at the usual start to which
+one of them has to bring it: to fall by less, a plateau of noise suffices."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,23 @@ def search_contact(
             "phys-geo: every rollout of the search diverged.", todo="check the masses, the units and the step_s."
         )
     return result
+
+
+def friction_on_ice(world: World, batch: SearchBatch, start: Sequence[tuple[Parameter, float]]) -> float | None:
+    """Return a friction far below that of usual materials with which bodies that glide are predicted better; or None.
+
+    A ball rolls with any friction from two sevenths of the slope on, and a puck on air has almost none: above, the
+    error of a prediction is a plateau, and no sample of a search falls into the valley below.
+    """
+    names = [p for p, _ in start]
+    place = next((k for k, p in enumerate(names) if p.name == FRICTION.name), None)
+    if place is None:
+        return None
+    tried = np.stack([np.array([p.encode(value) for p, value in start])] * (1 + len(ICE)))
+    tried[1:, place] = [names[place].encode(friction) for friction in ICE]
+    errors = open_loop_errors(world, batch.observations, batch.warm, names)(tried).mean(1)
+    lowest = int(np.nan_to_num(errors, nan=np.inf).argmin())
+    return ICE[lowest - 1] if lowest and errors[lowest] < ICE_SHARE * errors[0] else None
 
 
 def default_population(episodes: int, parameters: int = USUAL_PARAMETERS) -> int:

@@ -14,6 +14,7 @@ from cgwm.pipeline.optimization.levenberg_marquardt import minimise
 from cgwm.pipeline.phys_geo.tracks import contact_fit, contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_fit import NEVER_TOUCHES, fit_physics
 from cgwm.pipeline.phys_geo.tracks.contact_result import _derived
+from cgwm.pipeline.phys_geo.tracks.open_loop_search import SearchBatch, friction_on_ice
 from cgwm.pipeline.physics import restitution
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, FRICTION
@@ -21,7 +22,8 @@ from cgwm.pipeline.trajectories.initial_state import estimate_states, flight_fra
 from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.track_noise import Noise, estimate_noise
 from cgwm.schemas import PhysConfig
-from helpers.worlds import F64, box_body, law, state_of, times, world_of
+from helpers import fixed_surfaces as fixed
+from helpers.worlds import F64, ball_body, box_body, law, state_of, times, world_of
 from scipy.spatial.transform import Rotation
 
 NOISE = Noise(0.0005, 0.005)
@@ -280,3 +282,20 @@ def test_slides_are_searched_anew_until_their_first_velocities_stay(
     assert len(searched) == rounds and searched[0] == (0.3, False, False)
     assert all(again[1:] == (True, True) for again in searched[1:])
     assert (abs(FRICTION.decode(torch.tensor(found.mean[0])) - true_mu) < 2e-3) == (not flying)
+
+
+@pytest.mark.parametrize(("friction", "found"), [(0.02, 0.02), (0.3, None)])
+def test_a_ball_that_slips_down_a_slope_is_searched_at_low_frictions(friction: float, found: float | None) -> None:
+    slope = np.radians(10)
+    normal, down = np.array([np.sin(slope), 0, np.cos(slope)]), np.array([np.cos(slope), 0, -np.sin(slope)])
+    plane = fixed.half_space(quat=fixed.turn((0, 1, 0), 10))
+    world = replace(world_of(ball_body(0.02), contact=law(0.3), ground=False), surfaces=(plane,))
+    begun = state_of((tuple(0.02 * normal), (1, 0, 0, 0), tuple(0.1 * down), (0, 0, 0)))
+    made = roll_out(replace(world, contact=law(friction)), begun, times(0.8, 60)).position_m[0, :, 0].numpy()
+    noise = Noise(2e-4, 0.01)
+    track = Track(times(0.8, 60).numpy(), made + noise[0] * np.random.default_rng(0).standard_normal(made.shape))
+    seen = Observations.of(world, [Episode("slide", {"ball": track})], [(-1.0, 2.0)])
+    warm = warmup_frames(world, seen, 0.1)
+    seen, solution = estimate_states(world, seen, warm, noise, 5)
+    start = [(p, p.prior[0]) for p in CONTACT_PARAMETERS]
+    assert friction_on_ice(world, SearchBatch(seen, warm, solution.state_cov), start) == found
