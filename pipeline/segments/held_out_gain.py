@@ -6,7 +6,7 @@ of the episodes then predicts the fall of the misfit of the others, without anot
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +59,16 @@ class HeldOutGain:
     def matters(self) -> bool:
         """Whether the misfit falls beyond chance, and by a visible share."""
         return self.beyond_chance and self.share > SEGMENT_THRESHOLDS.choice.least_share
+
+
+def has_number(changes: Iterable[tuple[float, float | None]]) -> bool:
+    """Return whether one of some estimates differs from its value before by more than its error, so that it is a number.
+
+    Args:
+        changes: Of each estimate its change, and its standard error, None where the data say nothing about it.
+    """
+    least = SEGMENT_THRESHOLDS.choice.least_errors
+    return any(error is None or abs(change) >= least * error for change, error in changes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

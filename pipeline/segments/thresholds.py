@@ -305,6 +305,13 @@ class ChoiceThresholds:
     )
     least_episodes: int = threshold(8, "episodes", "fewest tosses with measured rotation", BY_ARGUMENT)
     looked_at: int = threshold(16, "episodes", "most of which flights are compared", BY_ARGUMENT)
+    least_errors: float = threshold(
+        3.0,
+        "standard errors",
+        "centre of mass or moments that were chosen are not taken over unless one of their numbers differs by this "
+        "much from what the capture gives",
+        BY_ARGUMENT,
+    )
     worse_chi2: float = threshold(
         25.0,
         "chi2",

@@ -79,11 +79,11 @@ from .driven_joints import fit_driven_joints
 from .earlier_estimates import EarlierEstimates
 from .force_fit import with_forces
 from .glides import fit_gliding_joints
-from .inertia_fit import MASS_PARTS, fit_mass_distribution
+from .inertia_fit import MASS_PARTS, fit_mass_distribution, mass_parameters
 from .joint_fit import fit_joints
 from .measured_forces import measured_forces
 from .open_loop_search import ENOUGH_EPISODES, SearchBatch, friction_on_ice, open_loop_errors, search_contact
-from .part_choice import SCALE, asked_parts, choose_parts, without_contradicted
+from .part_choice import SCALE, asked_parts, choose_parts, without_contradicted, without_number
 
 MAX_SPAN_S = 0.8
 """Maximum duration of an episode in the fit, from its start [s]: after a dozen impacts the motion carries no
@@ -368,6 +368,13 @@ def _with_chosen_parts(
     while wanted:
         mass = fit_mass_distribution(world, data.episodes, start, data.noise, wanted)
         unasked = [part for part in wanted if part not in asked_parts(config)]
+        if choice is not None:
+            given = {p.name: value for p, value in mass_parameters(world, wanted)}
+            choice = without_number(choice, mass.parameters, given)
+            kept = [part for part in wanted if part in {*asked_parts(config), *choice.chosen}]
+            if kept != wanted:
+                wanted, mass = kept, None
+                continue
         if not unasked or choice is None or not flights_contradict(world, mass.world, data.episodes, data.noise):
             world = mass.world
             break

@@ -2,13 +2,14 @@
 
 The parts are the centre of mass, the second moments of mass and the scale of lengths. Each set of them is judged by the
 misfit of tosses that its estimate has not seen (`segments/held_out_gain.py`). A part stays out unless it lowers this
-misfit beyond chance, also beside a drag where tosses ask for one; the scale also has to beat the effects that look the
-same in flight.
+misfit beyond chance, also beside a drag or an offset of the marker where tosses ask for one; the scale and the centre
+of mass also have to beat the effects that look the same in flight. What is fitted then has to have a number: a part all
+of whose numbers lie within their errors of what the capture gives is not taken over (`without_number`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -16,12 +17,12 @@ import numpy as np
 
 from ....datasets.capture.tracks import Episode
 from ....datasets.io.progress import note
-from ....schemas import FitChoice, HeldOutFall, PhysConfig
+from ....schemas import FitChoice, FittedParameter, HeldOutFall, PhysConfig
 from ...physics.effects import ActiveEffect, load_effect
 from ...physics.effects.registry import FLIGHT_ALIASES
 from ...physics.parameters import GROUND_SHIFT, Parameter, contact_parameters, effect_parameters
 from ...physics.world import World
-from ...segments.held_out_gain import LEAST_EPISODES, ContactLinearization, HeldOutGain
+from ...segments.held_out_gain import LEAST_EPISODES, ContactLinearization, HeldOutGain, has_number
 from ...trajectories.initial_state import flight_frames
 from ...trajectories.observations import Observations
 from ...trajectories.track_noise import Noise
@@ -29,10 +30,11 @@ from .inertia_fit import MASS_PARTS, mass_parameters, turns
 
 SCALE = "length_scale"
 """The part that is an effect of the measurement; the others are those of the mass distribution."""
-RIVALS = ("gravity_scale", "clock_scale", "linear_drag")
-"""Effects that look like a scale of lengths before the first contact."""
+RIVALS = {SCALE: ("gravity_scale", "clock_scale", "linear_drag"), "centre_of_mass": ("marker_offset",)}
+"""Effects that look like a part before the first contact."""
 DRAGS = ("linear_drag", "quadratic_drag")
-"""Forces that a fit of the mass distribution would follow for lack of anything else."""
+FOLLOWED = (*DRAGS, "marker_offset")
+"""Effects that a fit of the mass distribution would follow for lack of anything else."""
 FLIGHT_FRAMES = 3
 """Minimum number of frames before the first contact, which determine the velocities at it."""
 WORDS = {"centre_of_mass": "centre of mass", "second_moments": "second moments of mass", SCALE: "scale of lengths"}
@@ -90,19 +92,44 @@ def _tosses(world: World, episodes: Sequence[Episode]) -> list[Episode]:
 def _open_parts(world: World, config: PhysConfig) -> Parts:
     """Return the parts that the settings leave open, and that no effect of the world has in its place."""
     present = {active.effect.name for active in world.effects}
-    alike = {name for group in FLIGHT_ALIASES if SCALE in group for name in group} | set(RIVALS)
+    alike = {name for group in FLIGHT_ALIASES if SCALE in group for name in group} | set(RIVALS[SCALE])
     mass = MASS_PARTS if config.mass_distribution == "auto" and not present & {"com_offset", "inertia_shape"} else ()
     return (*mass, *((SCALE,) if config.length_scale == "auto" and not present & alike else ()))
 
 
+def without_number(choice: FitChoice, fitted: Sequence[FittedParameter], given: Mapping[str, float]) -> FitChoice:
+    """Return a choice without the parts all of whose numbers lie within their errors of what was given.
+
+    Args:
+        choice: The choice.
+        fitted: Parameters of the mass distribution.
+        given: Their values before, by name.
+    """
+    for part, mark in (("centre_of_mass", ".com_"), ("second_moments", ".moment_")):
+        own = [(one.estimate - given[one.name], one.std_error) for one in fitted if mark in one.name]
+        if part in choice.chosen and not has_number(own):
+            why = "but no number of it differs from what the capture gives beyond chance"
+            choice = _left_out(choice, part, f"would lower the misfit about first contacts, {why}")
+    return choice
+
+
 def without_contradicted(choice: FitChoice, part: str) -> FitChoice:
     """Return a choice without a part with which flights fit worse."""
+    return _left_out(
+        choice,
+        part,
+        "would lower the misfit about first contacts, but the flights, which no law of contact enters, fit worse with "
+        "what these ask for",
+    )
+
+
+def _left_out(choice: FitChoice, part: str, why: str) -> FitChoice:
+    """Return a choice without a part, and why."""
     chosen = tuple(one for one in choice.chosen if one != part)
     kept = f"; the {_listed(chosen)} {'are' if _plural(chosen) else 'is'} fitted, too" if chosen else ""
     sentence = (
-        f"By cross-validation over {choice.episodes} training tosses the {WORDS[part]} would lower the misfit about "
-        f"first contacts, but the flights, which no law of contact enters, fit worse with what these ask for, and it "
-        f"stays as before{kept}."
+        f"By cross-validation over {choice.episodes} training tosses the {WORDS[part]} {why}, and it stays as before"
+        f"{kept}."
     )
     return choice.model_copy(update={"chosen": chosen, "sentence": sentence})
 
@@ -122,7 +149,8 @@ class _Comparison:
     def of(world: World, tosses: Sequence[Episode], noise: Noise, asked: Parts) -> _Comparison:
         """Linearise the misfit of the tosses."""
         own = {active.effect.name for active in world.effects}
-        added = [name for name in dict.fromkeys((SCALE, *RIVALS, *DRAGS)) if name not in own]
+        rivals = [name for some in RIVALS.values() for name in some]
+        added = [name for name in dict.fromkeys((SCALE, *rivals, *FOLLOWED)) if name not in own]
         neutral = tuple(ActiveEffect.of(load_effect(name), {}, world.gravity) for name in added)
         wide = replace(world, effects=(*world.effects, *neutral))
         base = [(p, p.prior[0]) for p in (*contact_parameters(world), GROUND_SHIFT)]
@@ -150,8 +178,8 @@ class _Comparison:
         """Return the best set of the open parts, each of which is needed."""
         sets = [some for count in range(1, len(open_parts) + 1) for some in combinations(open_parts, count)]
         gains = {some: self.gain(some) for some in sets}
-        drag = self._drag()
-        beside = () if drag is None else (drag,)
+        drag, followed = self._asked_for(DRAGS), self._asked_for(FOLLOWED)
+        beside = () if followed is None else (followed,)
         admitted = [
             some
             for some in sets
@@ -168,28 +196,30 @@ class _Comparison:
                 HeldOutFall(parts=some, share=gains[some].share, std_error=gains[some].std_error) for some in sets
             ),
             sentence=_sentence(len(self.linear.score), open_parts, chosen, gains.get(chosen))
-            + ("" if drag is None or chosen else _force(drag, self.gain(beside))),
+            + ("" if drag is None or chosen else _force(drag, self.gain((drag,)))),
         )
 
-    def _drag(self) -> str | None:
-        """Return the drag that held-out tosses ask for most; None where they ask for none."""
-        gains = {name: self.gain((name,)) for name in DRAGS if name in self.columns}
+    def _asked_for(self, effects: Sequence[str]) -> str | None:
+        """Return which of some effects held-out tosses ask for most; None where they ask for none."""
+        gains = {name: self.gain((name,)) for name in effects if name in self.columns}
         return max((name for name in gains if gains[name].matters), key=lambda name: gains[name].share, default=None)
 
-    def _beside(self, parts: Parts, drag: Parts) -> HeldOutGain:
-        """Return the gain of parts beside a drag: what a force in flight explains is no mass distribution."""
-        return self.gain((*parts, *drag), drag)
+    def _beside(self, parts: Parts, other: Parts) -> HeldOutGain:
+        """Return the gain of parts beside another effect: what that explains in flight is no mass distribution."""
+        return self.gain((*parts, *other), other)
 
     def _needed(self, part: str, chosen: Parts) -> bool:
         """Return whether held-out tosses miss a part of the chosen ones."""
         return self.gain(chosen, _without(chosen, part)).matters
 
     def _beats_rivals(self, parts: Parts) -> bool:
-        """Return whether a scale among the parts predicts better than each effect that looks the same in flight."""
-        if SCALE not in parts:
-            return True
-        others = _without(parts, SCALE)
-        return all(self.gain(parts, (*others, rival)).beyond_chance for rival in RIVALS if rival in self.columns)
+        """Return whether each of the parts predicts better than each effect that looks the same in flight."""
+        return all(
+            self.gain(parts, (*_without(parts, part), rival)).beyond_chance
+            for part in parts
+            for rival in RIVALS.get(part, ())
+            if rival in self.columns
+        )
 
 
 def _without(parts: Parts, part: str) -> Parts:

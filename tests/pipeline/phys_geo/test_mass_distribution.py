@@ -14,7 +14,7 @@ from cgwm.pipeline.fit import fit
 from cgwm.pipeline.phys_geo.tracks import contact_shooting
 from cgwm.pipeline.phys_geo.tracks.contact_result import FitRecord
 from cgwm.pipeline.phys_geo.tracks.inertia_fit import fit_mass_distribution
-from cgwm.pipeline.phys_geo.tracks.part_choice import choose_parts, without_contradicted
+from cgwm.pipeline.phys_geo.tracks.part_choice import choose_parts, without_contradicted, without_number
 from cgwm.pipeline.physics.effects import ActiveEffect, load_effect
 from cgwm.pipeline.physics.engine import rollout as roll_out
 from cgwm.pipeline.physics.parameters import CONTACT_PARAMETERS, apply_parameters, mass_distribution, scaled_inertia
@@ -27,6 +27,7 @@ from cgwm.schemas import (
     BoxShape,
     CaptureManifest,
     FitChoice,
+    FittedParameter,
     Ground,
     InputDataError,
     PhysConfig,
@@ -229,6 +230,18 @@ def test_a_model_holds_the_mass_distribution_that_was_fitted(
     drawn, entries = draw_parameters(file, 1.0, np.random.default_rng(0))  # all of it varies in rollouts
     assert drawn.bodies[0].inertia_kg_m2 != file.bodies[0].inertia_kg_m2
     assert all(entry.value != entry.estimate for entry in entries if entry.name in mass.parameters)
+
+
+@pytest.mark.parametrize(("moment", "stays"), [(1.02, False), (0.9, True)])
+def test_a_part_without_a_number_is_not_taken_over(moment: float, stays: bool) -> None:
+    every = mass_distribution("ball", 0.07)[3:]
+    fitted = [
+        FittedParameter(name=p.name, unit=p.unit, estimate=moment, std_error=0.02, bounds=p.bounds, state="fitted")
+        for p in every
+    ]
+    choice = FitChoice(episodes=14, chosen=("second_moments",), tested=(), sentence="chosen")
+    found = without_number(choice, fitted, {p.name: 1.0 for p in every})
+    assert bool(found.chosen) == stays and ("no number" in found.sentence) != stays
 
 
 def test_images_do_not_show_where_the_mass_is(capture: Path, tmp_path: Path) -> None:
