@@ -378,14 +378,14 @@ def record_figures(
         marks = [judge(truths[row["case"]], answers["cgwm"].get(row["case"]))["mark"] in RIGHT for row in own]
         if best:
             what = "pairs of effects, both" if part == "pairs" else f"effects of flight and measurement {part}"
-            reached = f", {100 * sum(marks) / sum(best):.0f} % of it" if sum(best) else ""
+            reached = f", {100 * sum(marks) / sum(best):.0f} % of that" if sum(best) else ""
             record(
                 "real_like",
                 figure=f"real-like, {what}: an observer who knows the errors would name",
                 value=f"{sum(best):.1f} of {len(best)} ({100 * np.mean(best):.0f} %)",
                 target="",
                 met=None,
-                note=f"of the same captures cgwm names {sum(marks)}{reached}",
+                note=f"cgwm names {sum(marks)} of the same captures of {command.rsplit(maxsplit=1)[-1]}{reached}",
                 command=command,
             )
     for key, where in (("open_loop_m", ""), ("flight_m", " before the first contact")):

@@ -40,7 +40,7 @@ def rebound(group: str, thing: Thing, speed_m_s: float) -> float:
     )
     motion = engine.simulate(Mechanics.of(thing, law), [], start, 0.08)
     time, height = motion.time_s, motion.position_m[:, 2]
-    lowest = int(np.argmin(height))
+    lowest = int(np.argmax(np.diff(height) > 0))  # of the first impact
     # a parabola through what flies up again, so that no step's own kind of velocity matters
     free = np.flatnonzero((np.arange(len(time)) > lowest) & (height > radius + 1e-4))
     free = free[: int(np.argmax(np.diff(free, append=len(time) + 1) > 1)) + 1]  # until it comes down again

@@ -62,7 +62,7 @@ class HeldOutGain:
 
 
 def has_number(changes: Iterable[tuple[float, float | None]]) -> bool:
-    """Return whether one of some estimates differs from its value before by more than its error, so that it is a number.
+    """Return whether one of some estimates differs from its value before beyond its error, so that it is a number.
 
     Args:
         changes: Of each estimate its change, and its standard error, None where the data say nothing about it.
