@@ -96,14 +96,15 @@ def resolved_flight(prepared: Prepared, after_flight: World, steps: Sequence[Sel
 def _is_asked(step: SelectionStep, steps: Sequence[SelectionStep]) -> bool:
     """Return whether contact can separate the equals of a selected effect.
 
-    It is not asked which tilt an episode has of its own, nor which drag it is where an effect of another step may act
-    through the drag: without any the other one, as the wind, would do nothing.
+    It is not asked which tilt an episode has of its own, nor which of several drags it is, which push in contact as in
+    flight, so that the error of the law of contact would decide, nor whether it is a drag where an effect of another
+    step may act through it: without any the other one, as the wind, would do nothing.
     """
-    if len(step.equals) < 2 or step.own_std is not None:
+    drags = ["drag" in one.candidate.effect.provides for one in step.equals]
+    if len(step.equals) < 2 or step.own_std is not None or all(drags):
         return False
-    drag = any("drag" in one.candidate.effect.provides for one in step.equals)
     others = (one for other in steps if other is not step for one in other.equals)
-    return not (drag and any("drag" in one.candidate.effect.needs for one in others))
+    return not (any(drags) and any("drag" in one.candidate.effect.needs for one in others))
 
 
 def _undoubled(steps: Sequence[SelectionStep], world: World) -> tuple[list[SelectionStep], World]:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.diagnose import verdict
-from cgwm.pipeline.diagnose.contact import sliding
+from cgwm.pipeline.diagnose.contact import flight_equals, sliding
 from cgwm.pipeline.diagnose.contact.contact_test import selected
 from cgwm.pipeline.diagnose.contact.friction_pyramid import FrictionPyramid
 from cgwm.pipeline.diagnose.contact.search import Chosen
@@ -125,6 +125,14 @@ def test_beside_a_force_of_another_law_nothing_smaller_is_named(odds: float, bic
     found = FlightSelection([SelectionStep((), (one,), True) for one in (first, second)], world_with("ball"), None)
     form = OtherForms(effect="length_scale", words="", gain=0.0, odds=odds, then="")
     assert flight_selection._is_mostly_other(found, [form]) == mostly
+
+
+@pytest.mark.parametrize(
+    ("equals", "asked"), [(("frame_tilt", "gravity_tilt"), True), (("linear_drag", "quadratic_drag"), False)]
+)
+def test_contact_does_not_decide_between_drags(equals: tuple[str, str], asked: bool) -> None:
+    step = SelectionStep((), tuple(evidence(name) for name in equals), True)
+    assert flight_equals._is_asked(step, [step]) == asked
 
 
 @pytest.mark.parametrize(("gain", "odds", "wrong"), [(5.0, 0.0, "ab"), (-1.0, 0.0, "a"), (5.0, -3.0, "")])
