@@ -23,6 +23,7 @@ from ..physics.world import World
 from ..trajectories.observations import Observations
 from ..trajectories.segmentation import clear_frames
 from ..trajectories.track_noise import Noise
+from .sliding.support import Support
 from .thresholds import SEGMENT_THRESHOLDS
 
 LIMITS = SEGMENT_THRESHOLDS.carried
@@ -132,8 +133,21 @@ def _beginnings(world: World, whole: Observations, noise: Noise) -> Iterator[Beg
         if not airborne and normal is not None:
             across = normal.numpy(force=True).astype(np.float64)
             places = places - (places @ across)[:, None] * across
+        elif not airborne and _bends(world, whole, episode, frames):
+            continue
         since = (times[frames] - times[frames[0]]).astype(np.float64)
         yield Beginning(episode=episode, frames=frames, times_s=since, places_m=places, airborne=airborne, up=up)
+
+
+def _bends(world: World, whole: Observations, episode: int, frames: NDArray[np.intp]) -> bool:
+    """Return whether the surfaces under a body turn between frames (n), where no acceleration is constant."""
+    if not world.surfaces or len(world.free) != 1:
+        return False
+    places, turns = whole.position_m[episode, frames, 0], whole.quat_wxyz[episode, frames, 0]
+    reach_m = SEGMENT_THRESHOLDS.sliding_data.near_surface_m
+    normals = Support.of(world, whole.free[0], places, turns, 2 * reach_m).mean(reach_m)
+    known = normals[normals.norm(dim=-1) > 0]
+    return len(known) > 1 and float((known @ known[0]).min()) < np.cos(LIMITS.bend_rad)
 
 
 def _ends(world: World, whole: Observations, noise: Noise) -> Iterator[Beginning]:

@@ -90,6 +90,9 @@ class CarriedThresholds:
     longest_s: float = threshold(0.2, "s", "latest release that is looked for", BY_ARGUMENT)
     free_s: float = threshold(0.06, "s", "shortest motion after the release", BY_ARGUMENT)
     window_s: float = threshold(0.35, "s", "motion from the first frame on that is a parabola", BY_ARGUMENT)
+    bend_rad: float = threshold(
+        0.1, "rad", "turn of the surfaces under a body in that time, from which on nothing is told", BY_ARGUMENT
+    )
     least_frames: int = threshold(8, "frames", "fewest that a beginning has", "parabola, step and its time")
     widths_s: tuple[float, ...] = threshold(
         (0.0, 0.008, 0.016, 0.024),

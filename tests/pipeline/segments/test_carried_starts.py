@@ -5,12 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cgwm.datasets.capture.tracks import Track
+from cgwm.datasets.capture.tracks import Episode, Track
 from cgwm.pipeline.segments.carried_starts import Beginning, _shape, _step, carried_ends, carried_starts
 from cgwm.pipeline.segments.release_detection import find_releases, from_releases
+from cgwm.pipeline.trajectories.observations import Observations
 from cgwm.pipeline.trajectories.segmentation import whole_episodes
 from cgwm.pipeline.trajectories.track_noise import Noise
+from helpers import fixed_surfaces as fixed
 from helpers.diagnosis_data import tosses, world_with
+from helpers.worlds import ball_body, world_of
 
 NOISE = Noise(3e-4, 1e-3)
 RATE_HZ = 148.0
@@ -111,3 +114,25 @@ def test_one_wrong_row_is_no_hand(row: int) -> None:
     position[row, 2] -= 0.07  # a number that was cut off
     wrong = [*episodes[:2], ("cut", {"ball": replace(track, position_m=position)}), *episodes[3:]]
     assert carried_starts(world, whole_episodes(world, wrong), NOISE) == {}
+
+
+def test_a_ball_that_rocks_in_a_half_pipe_is_in_no_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    radius, pipe = 0.02, 0.08
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 61)
+    ring = pipe * np.stack((np.sin(angles), 1 - np.cos(angles)), 1)
+    vertices = np.concatenate([np.column_stack((np.full(61, x), ring)) for x in (-0.5, 0.5)])
+    number = np.arange(60)[:, None]
+    faces = np.concatenate((number + np.array([0, 1, 62]), number + np.array([0, 62, 61])))
+    world = replace(world_of(ball_body(radius), ground=False), surfaces=(fixed.mesh_surface(vertices, faces),))
+    time = np.arange(60) / 120
+    arm, angle, speed, path = pipe - radius, 1.0, 0.0, []
+    for _ in time:
+        path.append((0.0, arm * np.sin(angle), pipe - arm * np.cos(angle)))
+        for _ in range(100):  # as a pendulum, with the inertia of rolling
+            speed -= 5 / 7 * 9.81 / arm * np.sin(angle) / 12000
+            angle += speed / 12000
+    track = Track(time, np.array(path) + 2e-4 * np.random.default_rng(0).standard_normal((60, 3)))
+    seen = Observations.of(world, [Episode("rock", {"ball": track})], [(-1.0, 2.0)])
+    assert carried_starts(world, seen, Noise(2e-4, 0.01)) == {}
+    monkeypatch.setattr("cgwm.pipeline.segments.carried_starts._bends", lambda *_: False)
+    assert carried_starts(world, seen, Noise(2e-4, 0.01)) != {}
