@@ -452,15 +452,28 @@ INLINE Number softness(const Published& p, int b) {
 
 // Distance of a point from the spheres of a body by the logarithm of a sum of exponentials, and the outward normal, all
 // in the frame of that body. Where the normal is undefined it is `up`. Returns whether the distance may be below `limit`.
-INLINE bool soft_distance(const Published& p, const Union& spheres, Vec at, Number limit, Vec up, Real& distance,
-                          Vec& outward) {
+// TOGETHER: all lanes of the warp ask, those of an environment for the same point, and divide the spheres among them.
+template <bool TOGETHER>
+INLINE bool soft_distance(const Lanes& lanes, const Published& p, const Union& spheres, Vec at, Number limit, Vec up,
+                          Real& distance, Vec& outward) {
     const Number point[3] = {plain(at.x), plain(at.y), plain(at.z)}, width = quotient(Number(NEGLIGIBLE), p.sharpness_per_m);
-    const Number nearest = nearest_in(spheres, point);
-    if (nearest - quotient(logarithm(Number(spheres.count)), p.sharpness_per_m) > limit) return false;
+    const int own = TOGETHER ? lanes.lane : 0, apart = TOGETHER ? LANES : 1;
+    Number nearest = Number(1e30);
+    if (TOGETHER) {
+        KEEP_LOOP
+        for (int i = own; i < spheres.count; i += apart) {
+            nearest = lesser(nearest, root(square_to(spheres, i, point)) - plain_radius(spheres, i));
+        }
+        nearest = plain(lanes.least(Real(nearest)));
+    } else {
+        nearest = nearest_in(spheres, point);
+    }
+    const bool far = nearest - quotient(logarithm(Number(spheres.count)), p.sharpness_per_m) > limit;
+    if (far && !TOGETHER) return false;
     Real total = Real(0);
     Vec gradient = none();
     KEEP_LOOP
-    for (int i = 0; i < spheres.count; i++) {
+    for (int i = own; i < spheres.count; i += apart) {
         if (!below(square_to(spheres, i, point), plain_radius(spheres, i), nearest + width)) continue;
         const Vec away = at - spheres.center(i);
         const Real length = root(dot(away, away));
@@ -468,11 +481,37 @@ INLINE bool soft_distance(const Published& p, const Union& spheres, Vec at, Numb
         total += power;
         gradient = gradient + power * reciprocal(at_least(length, Number(1e-12))) * away;
     }
+    if (TOGETHER) {
+        total = lanes.sum(total);
+        gradient = lanes.sum(gradient);
+    }
     distance = Real(nearest) - quotient(Number(1), p.sharpness_per_m) * logarithm(total);
     gradient = reciprocal(total) * gradient;
     const Real norm2 = dot(gradient, gradient);
     outward = plain(norm2) > Number(1e-16) ? inverse_root(norm2) * gradient : up;
-    return true;
+    return !far;
+}
+
+// Adds the impulse of a sphere of a (side 1) or b (side 0) with the other body, given its distance from that.
+INLINE void push_point(const Environment& env, int p, int side, const Motion* motions, Vec center, Real radius,
+                       Real distance, Vec outward, Acting& sum) {
+    const int a = pair_a(p), b = pair_b(p);
+    const Law& law = env.laws[0];
+    const Motion &ma = motions[a], &mb = motions[b];
+    const Real gap = distance - radius;
+    const Vec normal = side ? outward : -outward;
+    const Vec point = center - (radius + Number(0.5) * gap) * outward;
+    const Vec arm_a = point - env.bodies[a].position, arm_b = point - env.bodies[b].position;
+    const Vec velocity = ma.velocity + cross(ma.omega, arm_a) - mb.velocity - cross(mb.omega, arm_b);
+    const Real speed = dot(velocity, normal);
+    if (!acts(law, gap, speed)) return;
+    Vec one, two;
+    tangents(env, normal, one, two);
+    const Vec along = pushed(env.published, law, gap, speed, dot(velocity, one), dot(velocity, two));
+    const Vec impulse = along.x * normal + along.y * one + along.z * two;
+    sum.linear = sum.linear + impulse;
+    sum.angular_a = sum.angular_a + cross(arm_a, impulse);
+    sum.angular_b = sum.angular_b + cross(arm_b, impulse);
 }
 
 // Adds the impulses between two bodies: of the spheres of b with the union of a, then of those of a with that of b.
@@ -487,7 +526,8 @@ INLINE void push_pair(const Problem& problem, const Environment& env, const Own&
     const Number spin_a = size(ma.omega), spin_b = size(mb.omega), left = Number(1) - Number(0.5) * h * (spin_a + spin_b);
     const Number V = size(ma.velocity - mb.velocity) + spin_a * (ca.reach + soft) + spin_b * (cb.reach + soft);
     const Number limit = left > Number(0.01) ? quotient(h * V, left) + Number(1e-6) : Number(1e30);
-    if (!(size(env.bodies[a].position - env.bodies[b].position) - ca.reach - cb.reach - soft < limit)) return;
+    const bool near = size(env.bodies[a].position - env.bodies[b].position) - ca.reach - cb.reach - soft < limit;
+    if (!own.lanes.any(near)) return;
     Vec up = vec(Real(0), Real(0), Real(1));
 #if TURNED
     up = env.turn * up;
@@ -497,34 +537,39 @@ INLINE void push_pair(const Problem& problem, const Environment& env, const Own&
         const int mine = side ? a : b, other = side ? b : a, first = contact_start(p) + (side ? of_b : 0);
         const Union spheres = {problem.geometry, env.geometry + 4LL * sphere_start(other), sphere_count(other)};
         const Frame frame = frame_in(env, mine, other, rotations);
-        if (boxes_apart(env.constants[mine], env.constants[other], frame, Number(1 + 1e-5) * (limit + soft))) continue;
+        const bool may = near && !boxes_apart(env.constants[mine], env.constants[other], frame, Number(1 + 1e-5) * (limit + soft));
+        const Vec local_up = transposed(rotations[other], up);
+        Real distance;
+        Vec outward;
+#define QUERY(k)                                                                                                        \
+    const Place row = env.geometry + 4LL * problem.spheres[first + (k)];                                               \
+    const Real radius = problem.geometry.at(row + 3);                                                                  \
+    const Vec held = rotations[mine] * (problem.geometry.vector(row) - env.constants[mine].com);                       \
+    const Vec center = env.bodies[mine].position + held;                                                               \
+    const Vec local = transposed(rotations[other], center - env.bodies[other].position) + env.constants[other].com;    \
+    const Number limit_here = limit + plain(radius);
+#if LANES > 1
+        if (sphere_count(mine) < LANES) {
+            if (!own.lanes.any(may)) continue;
+            KEEP_LOOP
+            for (int k = 0; k < sphere_count(mine); k++) {
+                QUERY(k)
+                const bool there = soft_distance<true>(own.lanes, env.published, spheres, local, limit_here, local_up, distance, outward);
+                if (may && there && own.lanes.lane == 0) push_point(env, p, side, motions, center, radius, distance, rotations[other] * outward, sum);
+            }
+            continue;
+        }
+#endif
+        if (!may) continue;
         EACH_OWNED(own.lanes, first, sphere_count(mine), k) {
-            const Place row = env.geometry + 4LL * problem.spheres[first + k];
-            if (beside(env.constants[other], frame, problem.geometry.value + row, limit + soft)) continue;
-            const Real radius = problem.geometry.at(row + 3);
-            const Vec center = env.bodies[mine].position + rotations[mine] * (problem.geometry.vector(row) - env.constants[mine].com);
-            const Vec local = transposed(rotations[other], center - env.bodies[other].position) + env.constants[other].com;
-            Real distance;
-            Vec outward;
-            if (!soft_distance(env.published, spheres, local, limit + plain(radius), transposed(rotations[other], up), distance, outward)) continue;
-            outward = rotations[other] * outward;
-            const Real gap = distance - radius;
-            const Vec normal = side ? outward : -outward;
-            const Vec point = center - (radius + Number(0.5) * gap) * outward;
-            const Vec arm_a = point - env.bodies[a].position, arm_b = point - env.bodies[b].position;
-            const Vec velocity = ma.velocity + cross(ma.omega, arm_a) - mb.velocity - cross(mb.omega, arm_b);
-            const Real speed = dot(velocity, normal);
-            if (!acts(law, gap, speed)) continue;
-            Vec one, two;
-            tangents(env, normal, one, two);
-            const Vec along = pushed(env.published, law, gap, speed, dot(velocity, one), dot(velocity, two));
-            const Vec impulse = along.x * normal + along.y * one + along.z * two;
-            sum.linear = sum.linear + impulse;
-            sum.angular_a = sum.angular_a + cross(arm_a, impulse);
-            sum.angular_b = sum.angular_b + cross(arm_b, impulse);
+            if (beside(env.constants[other], frame, problem.geometry.value + env.geometry + 4LL * problem.spheres[first + k], limit + soft)) continue;
+            QUERY(k)
+            if (!soft_distance<false>(own.lanes, env.published, spheres, local, limit_here, local_up, distance, outward)) continue;
+            push_point(env, p, side, motions, center, radius, distance, rotations[other] * outward, sum);
         }
     }
 }
+#undef QUERY
 #endif
 
 // Adds the impulses of all contacts of a step to the bodies' velocities and angular momenta.

@@ -53,6 +53,7 @@ def pushed() -> tuple[World, State, dict[str, Track]]:
         ((-0.07, 0.005, 0.05), UPRIGHT, (0, 0, 0), (0, 0, 0)),
         count=2,
     )
+    at.position_m[1, 0, 0] += 0.3  # nothing touches there, while lanes beside have contacts
     way = torch.tensor([[-0.07, 0.005, 0.05], [0.02, 0.01, 0.05]], dtype=F64)
     command = Track(time_s=[0.0, 0.1], position_m=way.numpy(), quat_wxyz=torch.tensor([UPRIGHT] * 2).numpy())  # pyright: ignore[reportArgumentType]
     return world, at, {"finger": command}
