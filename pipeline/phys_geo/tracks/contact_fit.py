@@ -439,12 +439,18 @@ def _on_ice(ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfi
 
 
 def _moved(before: SearchBatch, after: SearchBatch, flying: Tensor) -> bool:
-    """Return whether a velocity of an episode that begins in contact is another one, beyond its standard error."""
-    change = (after.observations.state.velocity_m_s - before.observations.state.velocity_m_s).abs()[~flying]
+    """Return whether the speed of an episode that begins in contact is another one, beyond its standard error.
+
+    What changes across the way, into the ground or a surface and out of it, is not by friction.
+    """
     free = list(after.observations.free)
-    columns = [STATE_SIZE * column + 6 + axis for column in range(len(free)) for axis in range(3)]
-    std = after.start_cov.diagonal(dim1=1, dim2=2)[~flying][:, columns].clamp_min(0).sqrt()
-    return bool((change[:, free].flatten(1) > std).any())
+    first, second = (one.observations.state.velocity_m_s[~flying][:, free] for one in (before, after))
+    columns = torch.tensor([STATE_SIZE * column + 6 + axis for column in range(len(free)) for axis in range(3)])
+    covariance = after.start_cov[~flying][:, columns][:, :, columns].unflatten(1, (len(free), 3)).unflatten(3, (-1, 3))
+    own = torch.stack([covariance[:, k, :, k] for k in range(len(free))], 1)
+    way = torch.nn.functional.normalize(second, dim=-1)
+    variance = (way[..., None, :] @ own @ way[..., None]).squeeze(-1).squeeze(-1)
+    return bool((((second - first) * way).sum(-1).abs() > variance.clamp_min(0).sqrt()).any())
 
 
 def _contact_estimate(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..surfaces.fixed_surface import FixedSurface
-from ..surfaces.surface_mesh import SurfaceMesh
+from ..surfaces.surface_mesh import SurfaceMesh, rounded_reach
 
 STEP_M = 0.004
 """How far a sphere moves in most steps [m]."""
@@ -39,8 +38,7 @@ def packed_meshes(surfaces: Sequence[FixedSurface], radius_m: float) -> PackedMe
 
 def _reach(radius_m: float) -> float:
     """Return how far triangles are told from the centres of spheres [m]: one reach for radii that differ little."""
-    wanted = max(radius_m + max(0.5 * radius_m, STEP_M), STEP_M)
-    return 1.2 ** math.ceil(math.log(wanted, 1.2))
+    return rounded_reach(max(radius_m + max(0.5 * radius_m, STEP_M), STEP_M))
 
 
 @lru_cache(_KEPT)

@@ -12,7 +12,7 @@ from .fixed_surface import HALF_SPACE, FixedSurface
 
 MOST_GAP_M = 0.1
 """Gap between a body and a surface up to which `surface_gap` tells it."""
-NEAR_GAP_M = 0.01
+NEAR_GAP_M = 0.004
 """Gap within which the triangles of a mesh are looked at first."""
 
 

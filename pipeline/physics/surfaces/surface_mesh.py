@@ -7,6 +7,7 @@ So a ball in a groove has two contacts, one on a convex edge has one, and edges 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,6 +27,8 @@ FLAT = 1e-6
 """Sine of the angle up to which a way along the mesh counts as leading no closer."""
 ORDER = (0.2672612419124244, 0.5345224838248488, 0.8017837257372732)
 """Direction along which the contacts of a sphere are sorted by their normals, so that each keeps its slot."""
+MANY = 200
+"""Number of spheres from which on it is worth while to find what spheres may touch by cells."""
 _CHUNK = 2_000_000
 """Number of cells that are looked up at once."""
 _CELLS = (64, 1 << 18)
@@ -140,9 +143,18 @@ class SurfaceMesh:
         near = (outside.square().sum(-1) < reach.square()).nonzero().squeeze(1)
         if not len(near):
             return distance, feature
+        known = self._known_for(float(reach[near].max()), len(near), float(radii.max()))
         for part in near.split(self._together(reach[near])):
-            distance[part], feature[part] = self._query(centers[part], reach[part])
+            pairs = self._pairs(centers[part], reach[part]) if known is None else _looked_up(known, centers[part])
+            distance[part], feature[part] = self._query(centers[part], reach[part], *pairs)
         return distance, feature
+
+    def _known_for(self, reach_m: float, spheres: int, radius_m: float) -> Neighbourhood | None:
+        """Return a neighbourhood for spheres of a reach and a radius [m]; None where it is not worth while."""
+        known = [one for wide, one in self._neighbourhoods.items() if reach_m <= wide < 2 * reach_m]
+        if known:
+            return min(known, key=lambda one: one.reach_m)
+        return self.neighbourhood(rounded_reach(reach_m)) if spheres > MANY and reach_m < 2 * radius_m else None
 
     def _together(self, reach: Tensor) -> int:
         """Return of how many spheres, with what they reach (Q,), the triangles nearby are looked up at once."""
@@ -177,9 +189,8 @@ class SurfaceMesh:
         order = (query * len(self.topology.corners) + triangle).argsort()
         return query[order], triangle[order]
 
-    def _query(self, centers: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """Return distances and features (Q, MESH_CONTACTS) of spheres."""
-        query, triangle = self._pairs(centers, reach)
+    def _query(self, centers: Tensor, reach: Tensor, query: Tensor, triangle: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distances and features (Q, MESH_CONTACTS) of spheres; their numbers and triangles (N,) to look at."""
         away, region = _closest(centers[query], self._corners(centers)[triangle])
         far = away.square().sum(-1).sqrt()
         close = far < reach[query]
@@ -310,6 +321,23 @@ def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     for number, arm in {4: pa, 5: pb, 6: pc}.items():
         offset = torch.where((region == number)[:, None], arm, offset)
     return offset, region
+
+
+def rounded_reach(reach_m: float) -> float:
+    """Return a reach [m] that is as large or up to a fifth larger, one for all that differ little."""
+    return 1.2 ** math.ceil(math.log(reach_m, 1.2))
+
+
+def _looked_up(known: Neighbourhood, centers: Tensor) -> tuple[Tensor, Tensor]:
+    """Return which spheres (N,) may touch which triangles (N,), in the order of both."""
+    low, cells, starts, entries = (
+        torch.as_tensor(x, device=centers.device) for x in (known.low, known.cells, known.starts, known.triangles)
+    )
+    place = ((centers - low.to(centers)) / known.cell_m).floor().long()
+    within = ((place >= 0) & (place < cells)).all(-1).nonzero().squeeze(1)
+    flat = (place[within, 0] * cells[1] + place[within, 1]) * cells[2] + place[within, 2]
+    row, number = _counted(starts[flat + 1] - starts[flat])
+    return within[row], entries[starts[flat[row]] + number]
 
 
 def _counted(counts: Tensor) -> tuple[Tensor, Tensor]:
