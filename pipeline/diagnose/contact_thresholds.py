@@ -127,6 +127,14 @@ class SlidingThresholds:
         "by argument: as `lead_share`",
         "two nulls of real-like development in an engine with a pyramid: 1.12 and 1.43 of friction by direction",
     )
+    by_speed: tuple[str, ...] = threshold(
+        ("stribeck_friction", "viscous_friction"),
+        "effects",
+        "compared with a friction that changes at a line across the ground, and not named where that reaches "
+        "`pyramid_share`",
+        "by argument: beyond the line a body is slower",
+        "a bowling ball on a lane whose first 4 m are oiled: named in 3 of 3 before",
+    )
     carriers: int = threshold(
         3,
         "episodes",

@@ -69,7 +69,8 @@ def diagnosed_episodes(model: Model, capture: Capture, split: str) -> DiagnosedE
 
 def _more_episodes(capture: Capture, split: str) -> str:
     """Return what to do where a split has too few episodes: others of the capture may go into it."""
-    others = [name for name in capture.episodes() if name not in capture.episodes(split)]
+    splits = capture.manifest.splits
+    others = [name for one, names in splits.items() if one != split for name in names if name not in splits[split]]
     moved = f"move some of {', '.join(others[:3])} into '{split}' of [splits] in capture.toml, " if others else ""
     return f"{moved}{'or ' if others else ''}record more, or name another split with --split."
 

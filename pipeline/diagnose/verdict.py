@@ -62,7 +62,8 @@ class Findings:
     """The sliding segments and their fit without effects of contact; None without any."""
     as_pyramid: tuple[str, ...] = ()
     """Effects that slides show no better than a friction pyramid does, so that none is selected."""
-
+    as_line: tuple[str, ...] = ()
+    """The same for a friction that changes at a line across the ground."""
     misfits: tuple[PhaseMisfit, ...] = ()
     """How the law of contact describes each phase, the worst first; none where contact selected an effect."""
 
@@ -116,6 +117,7 @@ def find(
         limits=contact.limits,
         sliding=contact.sliding,
         as_pyramid=contact.as_pyramid,
+        as_line=contact.as_line,
         misfits=tuple(misfits),
     )
 

@@ -68,6 +68,8 @@ class ContactFindings:
     """The sliding segments and their fit without effects of contact; None without any."""
     as_pyramid: tuple[str, ...] = ()
     """Effects that slides show no better than a friction pyramid does, so that none is selected."""
+    as_line: tuple[str, ...] = ()
+    """The same for a friction that changes at a line across the ground."""
 
 
 def with_contact(
@@ -114,9 +116,10 @@ def with_contact(
         sliding=data.sliding,
     )
     shaped: set[str] = set()
+    lined: set[str] = set()
     for test in tests:
         evidence = test.evidence(data, kept)
-        equals = [] if shaped & {one.name for one in evidence[:1]} else selected(test, evidence, data)
+        equals = [] if (shaped | lined) & {one.name for one in evidence[:1]} else selected(test, evidence, data)
         added = test.added(data, equals[0]) if equals else None
         if added is not None:
             final, best = added
@@ -125,6 +128,7 @@ def with_contact(
             contact = Chosen(best, every, "contact")
             return replace(common, chosen=[*chosen, contact], evidence=listed, world=final)
         shaped |= {one.name for one in evidence if one.is_pyramid}
+        lined |= {one.name for one in evidence if one.is_line}
         data = replace(data, earlier={**data.earlier, test.name: evidence})
     return replace(
         common,
@@ -132,6 +136,7 @@ def with_contact(
         world=replace(resolved.after_flight, contact=data.world.contact),
         limits=tuple(_limits(data, candidates)),
         as_pyramid=tuple(sorted(shaped)),
+        as_line=tuple(sorted(lined)),
     )
 
 

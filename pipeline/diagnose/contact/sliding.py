@@ -26,6 +26,7 @@ from ..evidence.evidence import Evidence
 from ..thresholds import THRESHOLDS, SlidingThresholds
 from .contact_test import Bar, ContactData, ContactTest, Lead, fitted_evidence, ranked, tries_of
 from .friction_pyramid import FrictionPyramid
+from .friction_step import lines_across
 
 TURNS = frozenset(("orientation", "spin", "unmeasured_spin"))
 """Needs of effects that show in turns alone."""
@@ -79,7 +80,33 @@ class SlidingTest(ContactTest):
             told = replace(told, way_share=way_share(started, variant, fit))
         if data.world.ground_normal is not None and any(bar.passed(told) for bar in self.bars([told], data)):
             told = replace(told, pyramid_share=pyramid_share(started, variant, fit, least))
-        return [told if one is best else one for one in evidence]
+        evidence = [told if one is best else one for one in evidence]
+        if data.world.ground_normal is None:
+            return evidence
+        # contact segments may confirm what passes no bar here
+        return [self._beside_lines(one, candidates, found, started, least) for one in evidence]
+
+    def _beside_lines(
+        self,
+        one: Evidence,
+        candidates: Sequence[Candidate],
+        found: Sequence[tuple[Variant, SlidingFit]],
+        started: StartedSliding,
+        least: float,
+    ) -> Evidence:
+        """Return the evidence of an effect with what a friction that changes at a line reaches in its place.
+
+        Args:
+            one: The evidence.
+            candidates: The candidates.
+            found: Variants with their fits.
+            started: The sliding segments and their fit without effects.
+            least: Smallest chi2 without effects.
+        """
+        if one.name not in self.limits.by_speed or one.score < self.limits.score_sure:
+            return one
+        fits = [(v, fit) for v, fit in found if candidates[v.place] is one.candidate and v.constants == one.constants]
+        return replace(one, line_share=line_share(started, *fits[0], least)) if fits else one
 
     def leads(self, best: Evidence) -> tuple[Lead, ...]:
         """Return the leads in score, the second over effects that explain nearly as much.
@@ -103,7 +130,7 @@ class SlidingTest(ContactTest):
     def bars(self, equals: Sequence[Evidence], data: ContactData) -> tuple[Bar, ...]:
         """Return the bars for an effect, and for one that leaves next to nothing unexplained."""
         best = equals[0]
-        if best.falls_at_rest or best.is_pyramid:
+        if best.falls_at_rest or best.is_pyramid or best.is_line:
             return ()
         if data.sliding is not None and not _unexplained(data.sliding, self.limits.surplus_sigmas):
             return ()
@@ -213,6 +240,19 @@ def pyramid_share(started: StartedSliding, variant: Variant, fit: SlidingFit, ba
     own = fit.values[0, : fit.values.shape[1] - len(variant.parameters)]
     found = fit_sliding(world, [], [(fit.segments.in_world(world), own)], started.flight_parameters)[0]
     return (base - found.cost) / max(base - fit.cost, 1e-9)
+
+
+def line_share(started: StartedSliding, variant: Variant, fit: SlidingFit, base: float) -> float:
+    """Return the share of an effect's fall of chi2 that a friction which changes at a line reaches in its place.
+
+    Arguments as of `pyramid_share`.
+    """
+    own = fit.values[0, : fit.values.shape[1] - len(variant.parameters)]
+    lines = [
+        fit_sliding(started.segments.world, [one], [(fit.segments, own)], started.flight_parameters)[0].cost
+        for one in lines_across(fit.segments)
+    ]
+    return (base - min(lines, default=base)) / max(base - fit.cost, 1e-9)
 
 
 def _judged(

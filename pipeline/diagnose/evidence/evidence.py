@@ -69,6 +69,8 @@ class Evidence:
     """Fall of chi2 without the episode in which it falls most; infinite where it was not computed."""
     pyramid_share: float = 0.0
     """Share of its fall of chi2 that a friction pyramid in its place reaches; 0 where it was not compared with one."""
+    line_share: float = 0.0
+    """The same for a friction that changes at a line across the ground."""
     way_share: float | None = None
     """How far it moves a body that fixed surfaces carry, as a share of its way; None where it was not computed."""
     contact: Mapping[str, float] = field(default_factory=dict)
@@ -104,6 +106,11 @@ class Evidence:
     def is_pyramid(self) -> bool:
         """Whether slides are explained as well by a friction pyramid, which has no number of its own."""
         return self.pyramid_share > THRESHOLDS.sliding.pyramid_share
+
+    @property
+    def is_line(self) -> bool:
+        """Whether slides are explained as well by a friction that changes at a line across the ground."""
+        return self.line_share > THRESHOLDS.sliding.pyramid_share
 
     @property
     def is_number(self) -> bool:

@@ -287,8 +287,14 @@ def misfit_warnings(findings: Findings) -> list[str]:
 
 
 def law_warnings(findings: Findings) -> list[str]:
-    """Return a warning for each effect that slides show no better than a friction pyramid does."""
-    return [
+    """Return a warning for each effect that slides show no better than a law does that is no candidate."""
+    lines = [
+        f"{name}: not named, since the slides fit a friction that changes at a line across the ground as well: oil, "
+        "another floor, a worn spot. Next, record slides of several speeds over the same places, and slides that stay "
+        "on one side."
+        for name in findings.as_line
+    ]
+    return lines + [
         f"{name}: not named, since the slides fit a friction limited along each of two axes by itself as well, as "
         "engines with a friction pyramid have it and no surface does. Next, where they were measured on a surface, "
         "record slides along x, along y and between them."

@@ -13,6 +13,7 @@ from cgwm.datasets.capture.tracks import Track
 from cgwm.pipeline.compare.model_comparison import ComparedModel
 from cgwm.pipeline.compare.short_horizon_errors import short_errors
 from cgwm.pipeline.diagnose import diagnose
+from cgwm.pipeline.diagnose.episodes import _more_episodes
 from cgwm.pipeline.diagnose.report.wording import unseen_motion
 from cgwm.pipeline.fit import fit
 from cgwm.pipeline.geometry.rotation import quat_multiply, quat_to_matrix
@@ -270,3 +271,11 @@ def test_a_motion_within_the_noise_is_none() -> None:
     with pytest.raises(InputDataError, match="nothing moves by more than"):
         checked(spread / (0.8 * LIMITS.alike_sigmas))
     checked(spread / (1.5 * LIMITS.alike_sigmas))
+
+
+def test_too_few_episodes_of_a_split_name_those_of_others() -> None:
+    splits = {"train": ("a", "b"), "test": ("c",)}
+    capture = SimpleNamespace(manifest=SimpleNamespace(splits=splits))
+    assert _more_episodes(capture, "train").startswith("move some of c into 'train' of [splits] in capture.toml, or")  # pyright: ignore[reportArgumentType]
+    splits.pop("test")
+    assert _more_episodes(capture, "train").startswith("record more")  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,6 @@
 """Names that a diagnosis withholds: no number, no fall of held-out errors, a friction pyramid, a scale that sets in."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +12,7 @@ from cgwm.pipeline.diagnose import verdict
 from cgwm.pipeline.diagnose.contact import flight_equals, sliding
 from cgwm.pipeline.diagnose.contact.contact_test import selected
 from cgwm.pipeline.diagnose.contact.friction_pyramid import FrictionPyramid
+from cgwm.pipeline.diagnose.contact.friction_step import FrictionStep, lines_across
 from cgwm.pipeline.diagnose.contact.search import Chosen
 from cgwm.pipeline.diagnose.contact.sliding import SlidingTest
 from cgwm.pipeline.diagnose.evidence.effect_selection import SelectionStep
@@ -211,9 +212,63 @@ def test_friction_by_direction_is_not_named_where_a_pyramid_explains_slides_as_w
         len(SlidingTest().bars([evidence("anisotropic_friction", pyramid_share=s)], data)) for s in (0.5, share, 1.1)
     ]
     assert counts == [2, 2, 0]
-    findings: Any = SimpleNamespace(as_good=(), as_pyramid=("anisotropic_friction",))
+    findings: Any = SimpleNamespace(as_good=(), as_pyramid=("anisotropic_friction",), as_line=())
     (said,) = law_warnings(findings)
     assert "pyramid" in said and "Next, " in said and "slides along x, along y and between" in said
+
+
+def slides(braking: Any, spread: float = 0.0) -> Any:
+    """Straight slides from several speeds over 3 m along x, cut into pieces of 0.2 s, with a deceleration by place."""
+    times, rng, places = torch.arange(21, dtype=torch.float64) / 100, np.random.default_rng(4), []
+    for speed in (2.0, 2.6, 3.2, 3.8):
+        at, v, way = 0.0, speed, []
+        for _ in range(100):
+            way.append((at, 0.1 * spread * at, 0.0))
+            v = max(v - braking(at, v) * 0.01, 0.0)
+            at += 0.01 * v
+        places += [torch.tensor(way[k : k + 21], dtype=torch.float64) for k in range(0, 80, 20)]
+    position = torch.stack(places)[:, :, None] + 1e-4 * torch.as_tensor(rng.normal(size=(len(places), 21, 1, 3)))
+    seen = torch.ones(len(places), 21, 1, dtype=torch.float64)
+    observed = SimpleNamespace(position_m=position, seen=seen, times_s=times.expand(len(places), -1))
+    world = SimpleNamespace(gravity=torch.zeros(1, 3, dtype=torch.float64))
+    return SimpleNamespace(observations=observed, lengths=[21] * len(places), world=world)
+
+
+def test_a_line_is_looked_for_where_braking_changes_along_the_slides() -> None:
+    lines = lines_across(slides(lambda at, _: 0.4 if at < 1.5 else 2.0))
+    effects = [one.active.effect for one in lines]
+    assert len(lines) == 3 and abs(abs(effects[1].axis[0]) - 1) < 0.01  # pyright: ignore[reportAttributeAccessIssue]
+    assert min(abs(abs(one.place_m) - 1.5) for one in effects) < 0.25  # pyright: ignore[reportAttributeAccessIssue]
+    few = slides(lambda *_: 1.0)
+    few.lengths = [3] * len(few.lengths)
+    assert lines_across(few) == []
+
+
+def test_a_line_changes_the_friction_beyond_it() -> None:
+    touch = Touch(
+        friction=torch.full((1, 3), 0.1, dtype=torch.float64), ground=True,
+        position=torch.tensor([[[0.0, 5.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]], dtype=torch.float64),
+        **{f.name: None for f in fields(Touch) if f.name not in ("friction", "ground", "position")},
+    )  # fmt: skip
+    step = FrictionStep(torch.tensor([1.0, 0.0, 0.0]), 1.0, 0.01)
+    found = step.contact({"d": torch.tensor([0.2], dtype=torch.float64)}, touch)
+    assert found.friction[0].tolist() == pytest.approx([0.1, 0.2, 0.3])
+    assert step.contact({}, replace(touch, ground=False)).friction is touch.friction
+
+
+def test_friction_by_speed_is_not_named_where_a_line_explains_slides_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    costs = iter((95.0, 40.0, 70.0))
+    monkeypatch.setattr(sliding, "fit_sliding", lambda *_: [SimpleNamespace(cost=next(costs))])
+    monkeypatch.setattr(sliding, "lines_across", lambda _: ["a", "b", "c"])
+    started: Any = SimpleNamespace(segments=SimpleNamespace(world=None), flight_parameters=())
+    fit: Any = SimpleNamespace(values=torch.zeros(1, 3), segments=None, cost=50.0)
+    assert sliding.line_share(started, SimpleNamespace(parameters=(1,)), fit, 100.0) == pytest.approx(1.2)
+    data: Any = SimpleNamespace(flown=False, explained=True, sliding=None)
+    counts = [len(SlidingTest().bars([evidence("viscous_friction", line_share=s)], data)) for s in (0.5, 1.2)]
+    assert counts[0] > 0 and counts[1] == 0
+    findings: Any = SimpleNamespace(as_good=(), as_pyramid=(), as_line=("stribeck_friction",))
+    (said,) = law_warnings(findings)
+    assert "changes at a line across the ground" in said and "Next, record slides of several speeds" in said
 
 
 @pytest.mark.parametrize(
