@@ -135,6 +135,16 @@ class SlidingThresholds:
         "by argument: beyond the line a body is slower",
         "a bowling ball on a lane whose first 4 m are oiled: named in 3 of 3 before",
     )
+    line_width: float = threshold(
+        0.02, "spans", "width over which friction changes at such a line, as a share of the places' span", BY_ARGUMENT
+    )
+    line_places: tuple[float, ...] = threshold(
+        (-0.08, 0.0, 0.08), "spans", "places that are tried, from where braking changes most", BY_ARGUMENT
+    )
+    line_slides: float = threshold(
+        0.1, "1", "deceleration from which a piece slides, as a share of the larger ones: less is rolling", BY_ARGUMENT
+    )
+    line_pieces: int = threshold(4, "pieces", "fewest sliding pieces on either side of a line", BY_ARGUMENT)
     carriers: int = threshold(
         3,
         "episodes",

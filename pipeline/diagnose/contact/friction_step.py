@@ -15,15 +15,9 @@ from ...physics.contact_law import Touch
 from ...physics.effects.effect import Effect, EffectParameter, Values
 from ...segments.candidates import Candidate, Variant, variants_of
 from ...segments.segments import Segments
+from ..thresholds import THRESHOLDS
 
-WIDTH_SHARE = 0.02
-"""Width over which the friction changes, as a share of the span of the places."""
-BESIDE = (-0.08, 0.0, 0.08)
-"""Places of the line that are tried, from where braking changes most, as shares of the span."""
-SLIDES_SHARE = 0.1
-"""Deceleration from which a piece slides, as a share of the larger ones: less is rolling."""
-FEWEST = 4
-"""Fewest sliding pieces on either side of a line."""
+LIMITS = THRESHOLDS.sliding
 
 
 class FrictionStep(Effect):
@@ -57,19 +51,19 @@ def lines_across(segments: Segments) -> list[Variant]:
         segments: The slides with fitted states.
     """
     places, braking = _braking(segments)
-    kept = braking > SLIDES_SHARE * torch.quantile(braking, 0.9) if len(braking) else braking > 0
+    kept = braking > LIMITS.line_slides * torch.quantile(braking, 0.9) if len(braking) else braking > 0
     places, braking = places[kept], braking[kept]
-    if len(places) < 2 * FEWEST:
+    if len(places) < 2 * LIMITS.line_pieces:
         return []
     axis = torch.linalg.svd(places - places.mean(0), full_matrices=False).Vh[0]
     along, order = torch.sort(places @ axis)
     level = braking[order]
-    count = torch.arange(FEWEST, len(level) - FEWEST + 1)
+    count = torch.arange(LIMITS.line_pieces, len(level) - LIMITS.line_pieces + 1)
     before, every = level.cumsum(0)[count - 1], level.sum()
     explained = before.square() / count + (every - before).square() / (len(level) - count)
     last = int(count[explained.argmax()])
     place, span = float(along[last - 1 : last + 1].mean()), float(along[-1] - along[0])
-    lines = [FrictionStep(axis, place + share * span, WIDTH_SHARE * span) for share in BESIDE]
+    lines = [FrictionStep(axis, place + share * span, LIMITS.line_width * span) for share in LIMITS.line_places]
     return variants_of([Candidate(one.name, one) for one in lines], segments.world.gravity[0, :1])
 
 
@@ -79,7 +73,7 @@ def _braking(segments: Segments) -> tuple[Tensor, Tensor]:
     where, size = [], []
     for k, length in enumerate(segments.lengths):
         seen = observed.seen[k, :length, 0] > 0
-        if int(seen.sum()) < FEWEST:
+        if int(seen.sum()) < LIMITS.line_pieces:
             continue
         times = observed.times_s[k, :length][seen]
         place = observed.position_m[k, :length, 0][seen]
