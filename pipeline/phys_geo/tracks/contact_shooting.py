@@ -84,7 +84,7 @@ def shoot_contact(
     )
     shot = shots[0]
     shared, covariance, growth = tempered(shot, prior, MODEL_EXCESS)
-    covariance = with_friction_law_error(covariance, parameters)
+    covariance = with_friction_law_error(covariance, parameters, shot.misfit)
     errors = open_loop_errors(world, data.batch.observations, data.batch.warm, parameters)
     cost = float(errors(shared[None]).mean())
     finite = math.isfinite(shot.cost) and math.isfinite(cost)

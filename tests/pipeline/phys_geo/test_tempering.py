@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 import torch
 from cgwm.pipeline.phys_geo.tracks.multiple_shooting import ShootingFit, ShootingPrior
-from cgwm.pipeline.phys_geo.tracks.tempered_posterior import FRICTION_LAW_STD, tempered, with_friction_law_error
+from cgwm.pipeline.phys_geo.tracks.tempered_posterior import (
+    FRICTION_LAW_MISFIT,
+    FRICTION_LAW_STD,
+    tempered,
+    with_friction_law_error,
+)
 from cgwm.pipeline.physics.parameters import CONTACT_TIME, FRICTION
 from cgwm.pipeline.physics.state import State
 
@@ -78,9 +83,10 @@ def test_bounds_hold() -> None:
     assert tempered(ended(DATA, misfit=1.0), tight, EXCESS)[0][1] >= 0.97
 
 
-def test_frictions_alone_have_the_error_of_the_law() -> None:
+@pytest.mark.parametrize(("misfit", "share"), [(0.0, 0.0), (0.25, 0.25), (1.0, 1.0), (7.0, 1.0)])
+def test_frictions_alone_have_the_error_of_the_law(misfit: float, share: float) -> None:
     pair = replace(FRICTION, name="friction[fingertip,object]")
     covariance = np.array([[0.04, 0.01, 0.02], [0.01, 0.09, 0.0], [0.02, 0.0, 0.16]])
-    wider = with_friction_law_error(covariance, [FRICTION, CONTACT_TIME, pair])
-    law = FRICTION_LAW_STD**2
+    wider = with_friction_law_error(covariance, [FRICTION, CONTACT_TIME, pair], misfit * FRICTION_LAW_MISFIT)
+    law = share * FRICTION_LAW_STD**2
     assert wider == pytest.approx(covariance + np.diag([law, 0.0, law]))
