@@ -18,15 +18,22 @@ from ..compare.short_horizon_errors import DIVERGED
 from ..diagnose.evidence.cross_validation import continued
 from ..optimization.tails import student_quantile
 from ..physics.model_world import world_of_model
+from ..physics.observation_model import measure
+from ..physics.world import World
 from ..runtime.resources import one_torch_thread
 from ..segments.prepare import Prepared, prepare
 from ..segments.random_effects import with_fitted_groups
 from ..segments.release_detection import after_release
 from ..segments.segment_states import fit_states
 from ..segments.segments import Kind, Segments
+from ..segments.sliding.support import on_surfaces
 from ..trajectories.frame_times import episodes_at_clock
+from ..trajectories.initial_state import estimate_states, warmup_frames
+from ..trajectories.observations import Observations
 from ..trajectories.segmentation import Segment, whole_episodes
 
+WARMUP_S, WARMUP_ITERATIONS = 0.1, 5
+"""Start of a roll from which the rest of it is predicted [s], and maximum number of steps of the fit to it."""
 LEAST_FOR_STUDENT = 3
 """Minimum number of episodes for an interval by Student's t, which assumes normal logarithms of the ratios."""
 
@@ -56,7 +63,8 @@ def prepared_episodes(model: Model, capture: Capture, names: Sequence[str]) -> t
 def typical_errors(model: Model, capture: Capture, episodes: Sequence[Episode], prepared: Prepared) -> HeldOutErrors:
     """Return the typical prediction errors of each episode, in units of the measurement noise.
 
-    The state of a segment of flight or contact is fitted to its first half, and the second half is predicted.
+    The state of a segment of flight or contact is fitted to its first half, and the second half is predicted; on fixed
+    surfaces that of a whole episode to its start.
     Parameters that differ from episode to episode are fitted to these, with the spread that the model's fit has found.
 
     Args:
@@ -74,6 +82,8 @@ def typical_errors(model: Model, capture: Capture, episodes: Sequence[Episode], 
         has_orientation=prepared.observations.has_orientation,
         time_shift=prepared.observations.time_shift,
     )
+    if on_surfaces(world):
+        return HeldOutErrors(flight={}, contact=_open_loop_errors(world, whole, prepared))
     errors: dict[str, dict[str, float]] = {}
     kinds: tuple[tuple[Kind, Sequence[Segment]], ...] = (
         ("flight", () if prepared.flight is None else prepared.flight.items),
@@ -88,6 +98,22 @@ def typical_errors(model: Model, capture: Capture, episodes: Sequence[Episode], 
             joined = {name: torch.cat(values) for name, values in squares.items()}
             errors[kind] = {name: typical_error(values) for name, values in joined.items() if len(values)}
     return HeldOutErrors(flight=errors.get("flight", {}), contact=errors.get("contact", {}))
+
+
+def _open_loop_errors(world: World, whole: Observations, prepared: Prepared) -> dict[str, float]:
+    """Return the typical errors of whole rolls and slides on fixed surfaces, predicted from their starts.
+
+    What a short piece leaves of a resistance or a tilt is far below the noise.
+    """
+    warm = warmup_frames(world, whole, WARMUP_S)
+    begun, _ = estimate_states(world, whole, warm, prepared.noise, WARMUP_ITERATIONS)
+    columns = list(begun.free)
+    with torch.no_grad():
+        found = measure(begun.world(world), begun.state, begun.times_s, begun.drives).position_m[:, :, columns]
+    rows = torch.nan_to_num((found - begun.position_m) / prepared.noise.position_m, nan=DIVERGED, posinf=DIVERGED)
+    square = rows.square().mean(-1)[..., 0]
+    late = (begun.seen[..., 0] > 0) & ~warm
+    return {name: typical_error(square[k][late[k]]) for k, name in enumerate(begun.names) if bool(late[k].any())}
 
 
 def _late_squares(segments: Segments) -> list[Tensor]:
