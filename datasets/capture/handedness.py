@@ -41,6 +41,9 @@ NATS, SPREAD = 6.0, 0.02
 torques are uncertain at best."""
 TO_EACH = 2
 """Pieces to which one impact belongs."""
+EPISODES, OF_EPISODE = 2, 3
+"""Fewest episodes that have to show an exchange, and number of pieces of an episode, of changes or of rolls, from which
+on they rule it out where they do not: a force that is not the ground's may look like an exchange in one episode."""
 EXCHANGES: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "as written": ((1.0, 0.0), (0.0, 1.0)),
     "first mirrored": ((-1.0, 0.0), (0.0, 1.0)),
@@ -69,11 +72,17 @@ def mirrored_axes(manifest: CaptureManifest, motions: Sequence[TrackedMotion]) -
     inertia = None if not turning else inertia_per_mass(turning[0].body)
     if inertia is None:
         return None
-    cosines = np.concatenate([c for m in turning for c in _cosines(m, normal, ground.offset_m, inertia)])
+    each = [list(_cosines(m, normal, ground.offset_m, inertia)) for m in turning]
+    cosines = np.concatenate([found for one in each for found in one]) if each else np.empty((0, len(EXCHANGES)))
     if len(cosines) < FEWEST:
         return None
     away = 1 - cosines.mean(0) + SPREAD
     best = int(away.argmin())
+    gains = [[found[:, best] - found[:, 0] for found in one] for one in each]
+    if any(len(gain) >= OF_EPISODE and gain.mean() <= 0 for one in gains for gain in one):
+        return None
+    if sum(float(sum(gain.sum() for gain in one)) > 0 for one in gains) < EPISODES:
+        return None
     sure = len(cosines) / TO_EACH * float(np.log(away[0] / away[best])) >= NATS and 1 - away[best] >= AGREES - SPREAD
     return _correction(list(EXCHANGES)[best], normal) if sure else None
 

@@ -74,7 +74,7 @@ from .contact_result import (
     physics_fit,
     with_damping,
 )
-from .contact_shooting import ShootingEpisodes, shoot_contact
+from .contact_shooting import GLIDING_TOLERANCE, OPEN_LOOP_TOLERANCE, ShootingEpisodes, shoot_contact
 from .driven_joints import fit_driven_joints
 from .earlier_estimates import EarlierEstimates
 from .force_fit import with_forces
@@ -467,8 +467,10 @@ def _contact_estimate(
         )
         return estimate, record
     episodes = ShootingEpisodes(episodes=data.searched, spans=data.spans, batch=batch)
+    begins_in_contact = not flight_frames(ready.world, batch.observations)[:, 0].any()
+    tolerance = GLIDING_TOLERANCE if _glides(ready, batch) and begins_in_contact else OPEN_LOOP_TOLERANCE
     estimate, shooting = shoot_contact(
-        ready.world, episodes, search, ready.parameters, ready.ground_known, data.noise, config
+        ready.world, episodes, search, ready.parameters, ready.ground_known, data.noise, config, tolerance
     )
     return estimate, replace(record, shooting=shooting)
 

@@ -93,3 +93,18 @@ def test_exchanged_level_axes_are_refused_with_the_remedy(tmp_path: Path, motion
     words = {"y axis": "multiply py_m by -1", "x axis": "multiply px_m by -1", "axes x and y": "exchange px_m and py_m",
              "90 degrees": "write py_m as px_m and -px_m as py_m"}  # fmt: skip
     assert next(text for key, text in words.items() if key in said) in str(error.value)
+
+
+def test_an_episode_that_shows_the_frame_as_written_rules_an_exchange_out(tmp_path: Path) -> None:
+    mirror = np.diag([1.0, -1.0, 1.0])
+    root = capture_of(tmp_path / "c", bounced, mirror)
+    right = capture_of(tmp_path / "d", rolled, np.eye(3))
+    (root / "tracks" / "0.csv").write_text((right / "tracks" / "0.csv").read_text())
+    assert check_consistency(Capture.open(root)) == []
+
+
+def test_one_episode_alone_shows_no_exchange(tmp_path: Path) -> None:
+    root = capture_of(tmp_path / "c", rolled, np.diag([1.0, -1.0, 1.0]))
+    for k in range(1, 8):
+        (root / "tracks" / f"{k}.csv").unlink()
+    assert check_consistency(Capture.open(root)) == []
