@@ -123,6 +123,8 @@ def seen(model: Path, capture: Path, truth: dict[str, Any]) -> Seen:
     total = np.zeros((starts["end"], starts["end"]))
     for k, item in enumerate(items):
         rows = _whitened(plain, slopes, k, errors, episodes[prepared.names[item.episode]]["bursts_s"])
+        if not len(rows):  # too few frames show nothing
+            continue
         own, states = rows[:, :size], rows[:, size:]
         every_column = np.zeros((len(rows), starts["end"]))
         every_column[:, :size] = own
@@ -167,7 +169,7 @@ def _whitened(flights: Segments, slopes: Array, k: int, errors: Errors, bursts_s
         root = np.linalg.cholesky(covariance) / flights.noise[kind]
         own = slopes[k][mask][:, 3 * kind : 3 * kind + 3].reshape(len(t), -1)
         parts.append(np.linalg.solve(root, own).reshape(3 * len(t), -1))
-    return np.concatenate(parts)
+    return np.concatenate(parts) if parts else np.empty((0, slopes.shape[-1]))
 
 
 def limit(found: Seen, effect: dict[str, Any]) -> tuple[float, float] | None:

@@ -228,8 +228,9 @@ def _judged(result: ImproveResult) -> str:
     )
     short = (
         "Prediction error: the motion is cut into segments of flight and contact; the state of each is fitted to its "
-        "first half, and the second half is predicted. Frames are averaged on a logarithmic scale, so that a few "
-        "impacts do not outweigh a long flight. The unit is the noise of the measurement; the error of the fitted "
+        "first half, and the second half is predicted (on fixed surfaces to the first 0.1 s of an episode, and the "
+        "rest of it is predicted). Frames are averaged on a logarithmic scale, so that a few impacts do not outweigh a "
+        "long flight. The unit is the noise of the measurement; the error of the fitted "
         "state is included, so that a perfect model has an error above 1."
     )
     return section("How it was judged", paragraph(words), paragraph(short))

@@ -25,9 +25,10 @@ OPEN_LOOP_TOLERANCE = 8.0
 """Maximum ratio of the open-loop error of shooting to that of the search, for bodies that nothing drives; above it the
 search's estimate is kept. In a rough motion over impacts the search makes up for what the contact model lacks by a
 friction that is a fifth too low, and predicts other tosses no better (102 motions of MuJoCo, DART and Rapier)."""
-GLIDING_TOLERANCE = 1.2
+GLIDING_TOLERANCE = 1.0
 """The same where all bodies slide or roll from the first frame on: such motion is smooth, and the search finds its best
-friction. Ties that let the spin jump from segment to segment make up for a friction that is too low to roll with."""
+friction. Ties that let the spin jump from segment to segment make up for a friction that is too low to roll with, and
+above the one with which a ball just rolls no friction predicts better than another."""
 STARTS = ((0.5, 1.0), (1.0, 1.0), (1.7, 1.0), (1.0, 0.6), (1.0, 1.6))
 """Further starts of shooting: friction and contact time as multiples of the priors' medians."""
 BEST = 3

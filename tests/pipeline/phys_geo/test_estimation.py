@@ -301,7 +301,7 @@ def test_a_ball_that_slips_down_a_slope_is_searched_at_low_frictions(friction: f
     assert friction_on_ice(world, SearchBatch(seen, warm, solution.state_cov), start) == found
 
 
-@pytest.mark.parametrize(("rolls", "tolerance"), [(True, 1.2), (False, 8.0)])
+@pytest.mark.parametrize(("rolls", "tolerance"), [(True, 1.0), (False, 8.0)])
 def test_shooting_has_to_predict_rolls_as_well_as_the_search(
     monkeypatch: pytest.MonkeyPatch, rolls: bool, tolerance: float
 ) -> None:
