@@ -395,22 +395,21 @@ def _with_initial_states(world: World, data: _FitData, warmup_s: float) -> Searc
 
 
 def _searched(
-    ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfig, warm_started: bool
+    ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfig, warm_started: bool, glides: Tensor
 ) -> tuple[SearchBatch, SearchResult]:
     """Return what the search finds, and the episodes with the states from which it did.
 
-    Where bodies slide from the first frame on, their velocities after the warm-up depend on the friction with which
-    they were estimated: they are estimated anew with the one that is found, until they stay.
+    Where bodies slide from the first frame on (`glides`), their velocities after the warm-up depend on the friction
+    with which they were estimated: they are estimated anew with the one that is found, until they stay.
     """
     search = search_contact(ready.world, batch, ready.start, data.noise, config, warm_started)
-    flying = flight_frames(ready.world, batch.observations)[:, 0]
-    for _ in range(SEARCHES - 1 if _glides(ready, batch) else 0):
+    for _ in range(SEARCHES - 1 if glides.any() else 0):
         values = [p.decode(torch.tensor([value])) for (p, _), value in zip(ready.start, search.mean, strict=True)]
         names = [p for p, _ in ready.start]
         again = _with_initial_states(
             apply_parameters(ready.world, names, torch.stack(values, -1)), data, config.warmup_s
         )
-        if not _moved(batch, again, flying):
+        if not _moved(batch, again, glides):
             break
         batch = again
         start = [(p, float(value)) for p, value in zip(names, values, strict=True)]
@@ -418,15 +417,17 @@ def _searched(
     return batch, search
 
 
-def _glides(ready: _Ready, batch: SearchBatch) -> bool:
-    """Return whether a body slides or rolls in an episode from its first frame on, and nothing drives it."""
-    flying = flight_frames(ready.world, batch.observations)[:, 0]
-    return not (flying.all() or ready.world.chains or batch.observations.drives)
+def _glides(ready: _Ready, batch: SearchBatch) -> Tensor:
+    """Return whether in each episode (B,) bodies slide or roll from its first frame on, and nothing drives them."""
+    begins_in_contact = ~flight_frames(ready.world, batch.observations)[:, 0]
+    return begins_in_contact & (not (ready.world.chains or batch.observations.drives))
 
 
-def _on_ice(ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfig) -> tuple[_Ready, SearchBatch]:
+def _on_ice(
+    ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfig, glides: Tensor
+) -> tuple[_Ready, SearchBatch]:
     """Return the start at a friction far below that of usual materials, where bodies that glide ask for it."""
-    friction = friction_on_ice(ready.world, batch, ready.start) if _glides(ready, batch) else None
+    friction = friction_on_ice(ready.world, batch, ready.start) if glides.any() else None
     if friction is None:
         return ready, batch
     start = [
@@ -438,15 +439,15 @@ def _on_ice(ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfi
     return replace(ready, start=start), _with_initial_states(world, data, config.warmup_s)
 
 
-def _moved(before: SearchBatch, after: SearchBatch, flying: Tensor) -> bool:
-    """Return whether the speed of an episode that begins in contact is another one, beyond its standard error.
+def _moved(before: SearchBatch, after: SearchBatch, glides: Tensor) -> bool:
+    """Return whether the speed of an episode of those that glide is another one, beyond its standard error.
 
     What changes across the way, into the ground or a surface and out of it, is not by friction.
     """
     free = list(after.observations.free)
-    first, second = (one.observations.state.velocity_m_s[~flying][:, free] for one in (before, after))
+    first, second = (one.observations.state.velocity_m_s[glides][:, free] for one in (before, after))
     columns = torch.tensor([STATE_SIZE * column + 6 + axis for column in range(len(free)) for axis in range(3)])
-    covariance = after.start_cov[~flying][:, columns][:, :, columns].unflatten(1, (len(free), 3)).unflatten(3, (-1, 3))
+    covariance = after.start_cov[glides][:, columns][:, :, columns].unflatten(1, (len(free), 3)).unflatten(3, (-1, 3))
     own = torch.stack([covariance[:, k, :, k] for k in range(len(free))], 1)
     way = torch.nn.functional.normalize(second, dim=-1)
     variance = (way[..., None, :] @ own @ way[..., None]).squeeze(-1).squeeze(-1)
@@ -457,8 +458,9 @@ def _contact_estimate(
     ready: _Ready, data: _FitData, batch: SearchBatch, config: PhysConfig, warm_started: bool, record: FitRecord
 ) -> tuple[ContactEstimate, FitRecord]:
     """Return the contact parameters by the search, refined by shooting where there are few episodes."""
-    ready, batch = _on_ice(ready, data, batch, config)
-    batch, search = _searched(ready, data, batch, config, warm_started)
+    glides = _glides(ready, batch)
+    ready, batch = _on_ice(ready, data, batch, config, glides)
+    batch, search = _searched(ready, data, batch, config, warm_started, glides)
     record = replace(record, search_open_loop_m=search.history, search_effective_samples=search.effective_samples)
     covariance = episode_covariance(search, ENOUGH_EPISODES)
     if covariance is not None:
@@ -467,8 +469,7 @@ def _contact_estimate(
         )
         return estimate, record
     episodes = ShootingEpisodes(episodes=data.searched, spans=data.spans, batch=batch)
-    begins_in_contact = not flight_frames(ready.world, batch.observations)[:, 0].any()
-    tolerance = GLIDING_TOLERANCE if _glides(ready, batch) and begins_in_contact else OPEN_LOOP_TOLERANCE
+    tolerance = GLIDING_TOLERANCE if glides.all() else OPEN_LOOP_TOLERANCE
     estimate, shooting = shoot_contact(
         ready.world, episodes, search, ready.parameters, ready.ground_known, data.noise, config, tolerance
     )
