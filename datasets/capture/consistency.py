@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import Body, CaptureManifest, Ground, InputDataError, Shape
+from ...schemas import Body, CaptureManifest, Ground, InputDataError
+from ..shapes.meshes import primitive_properties
 from .folder import CaptureFolder
 from .handedness import mirrored_axes
 from .surface_distance import surface_distance
@@ -335,9 +336,10 @@ def _check_densities(capture: CaptureFolder, where: str) -> None:
     """
     for body in capture.manifest.bodies:
         _check_center(capture, body, where)
-        volume = None if body.shape is None else _volume_m3(body.shape)
-        if volume is None or body.mass_kg is None:
+        solid = primitive_properties(body.shape)
+        if solid is None or body.mass_kg is None:
             continue
+        volume = solid.volume_m3
         density = body.mass_kg / volume
         low, high = SOLID_KG_M3
         if not low <= density <= high:
@@ -356,13 +358,6 @@ def _check_center(capture: CaptureFolder, body: Body, where: str) -> None:
             "a centre of mass within the shape, in metres.",
             "correct com_m or shape.",
         )
-
-
-def _volume_m3(shape: Shape) -> float | None:
-    """Return the volume of a box or a ball; None of other shapes."""
-    if shape.box is not None:
-        return 8 * float(np.prod(shape.box.half_extents_m))
-    return None if shape.sphere is None else 4 / 3 * np.pi * shape.sphere.radius_m**3
 
 
 def _contradiction(written: Agreement) -> str:

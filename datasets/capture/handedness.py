@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import Body, CaptureManifest
+from ...schemas import CaptureManifest
+from ..shapes.meshes import primitive_properties
 from ..shapes.turns import matrix_of, turn_between
 from .tracked_motion import TrackedMotion
 from .unit_mistakes import Correction
@@ -69,9 +70,10 @@ def mirrored_axes(manifest: CaptureManifest, motions: Sequence[TrackedMotion]) -
         return None
     normal = np.array(ground.normal) / np.linalg.norm(ground.normal)
     turning = [m for m in motions if m.track.turns and m.outline is not None]
-    inertia = None if not turning else inertia_per_mass(turning[0].body)
-    if inertia is None:
+    solid = primitive_properties(turning[0].body.shape) if turning else None
+    if solid is None:
         return None
+    inertia = solid.inertia_per_kg.diagonal()
     each = [list(_cosines(m, normal, ground.offset_m, inertia)) for m in turning]
     cosines = np.concatenate([found for one in each for found in one]) if each else np.empty((0, len(EXCHANGES)))
     if len(cosines) < FEWEST:
@@ -85,16 +87,6 @@ def mirrored_axes(manifest: CaptureManifest, motions: Sequence[TrackedMotion]) -
         return None
     sure = len(cosines) / TO_EACH * float(np.log(away[0] / away[best])) >= NATS and 1 - away[best] >= AGREES - SPREAD
     return _correction(list(EXCHANGES)[best], normal) if sure else None
-
-
-def inertia_per_mass(body: Body) -> Array | None:
-    """Return the inertia of a ball or box about its axes by its mass [m2], shape (3,); None of other shapes."""
-    if body.shape is not None and body.shape.sphere is not None:
-        return np.full(3, 0.4 * body.shape.sphere.radius_m**2)
-    if body.shape is not None and body.shape.box is not None:
-        square = np.array(body.shape.box.half_extents_m) ** 2
-        return (square.sum() - square) / 3
-    return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas import InputDataError
+from ...schemas import InputDataError, Shape
 from ...schemas.regular_files import read_binary_file
 from ..io.cells import number_of
 
@@ -200,6 +200,13 @@ def box_properties(half_extents_m: Array) -> SolidProperties:
 def sphere_properties(radius_m: float) -> SolidProperties:
     """Return the properties of a solid ball of radius [m], centred at the origin."""
     return SolidProperties(4 / 3 * np.pi * radius_m**3, np.zeros(3), np.eye(3) * 0.4 * radius_m**2)
+
+
+def primitive_properties(shape: Shape | None) -> SolidProperties | None:
+    """Return the properties of a box or a ball; None of other shapes."""
+    if shape is not None and shape.box is not None:
+        return box_properties(np.array(shape.box.half_extents_m))
+    return None if shape is None or shape.sphere is None else sphere_properties(shape.sphere.radius_m)
 
 
 def _read_obj(data: bytes) -> Mesh:
